@@ -1,0 +1,1 @@
+"""The acquisition daemon that runs on each Raspberry Pi."""

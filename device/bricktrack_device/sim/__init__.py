@@ -1,0 +1,1 @@
+"""Simulated hardware: one seeded world that the camera, the IMU and the trigger all ask."""
