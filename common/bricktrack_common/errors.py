@@ -17,7 +17,8 @@
     ├── VideoError (ValueError)         a video that cannot be decoded or paired with its time stamps
     └── TrackingError (ValueError)      no pose can be had from what was given
 
-A command line prints a `BricktrackError` as one line and exits with 1. Anything else is a bug and keeps its traceback.
+A command line prints a `BricktrackError` as one line and exits with 1. Anything else is a bug and keeps
+its traceback.
 """
 
 
