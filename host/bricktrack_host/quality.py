@@ -40,7 +40,7 @@ class PoseFlag(IntFlag):
     UNCOVERED = 32
     """A ray of this pose lies where the calibration extrapolates."""
     LED_PROFILE_UNKNOWN = 64
-    """The shape of the LED type was never fitted: a bias of some 0.1 mm is possible and is in the covariance."""
+    """LED shape never fitted; a bias of some 0.1 mm is possible, and is in the covariance."""
     DROPOUT = 128
     """Fused: no optical pose within one and a half frame periods."""
     IMPACT = 256
