@@ -1,0 +1,260 @@
+"""The stream of inertial samples: raw BNO055 registers as read, and what they mean in units."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntFlag
+from pathlib import Path
+from typing import Annotated, BinaryIO
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.errors import RunFormatError
+from bricktrack_common.streams import Field, StreamSchema, read_stream, write_stream
+from bricktrack_common.typed_data import convert
+
+FIRST_REGISTER = 0x08
+LAST_REGISTER = 0x35
+N_DATA_BYTES = LAST_REGISTER - FIRST_REGISTER + 1
+"""One burst: accelerometer to calibration status, 46 bytes (BNO055 data sheet, register map page 0)."""
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+_MAX_ACC_STEP_MPS2 = 300.0  # between samples 10 ms apart; 30 g is the worst impact expected on a table
+_MAX_GYRO_STEP_RADPS = 40.0
+
+IMU_SCHEMA = StreamSchema(
+    "bricktrack.imu",
+    1,
+    (
+        Field("slot", "int", "number of the 10 ms grid point since the grid's start"),
+        Field("t_before_ns", "int", "ns, CLOCK_MONOTONIC, before the bus transaction"),
+        Field("t_after_ns", "int", "ns, CLOCK_MONOTONIC, after it"),
+        Field("data", "bytes?", "registers 0x08..0x35, or nil where the read failed"),
+        Field("errno", "int", "error number of a failed read, else 0"),
+        Field("status", "bytes?", "SYS_STATUS, SYS_ERR, OPR_MODE where they were read"),
+    ),
+)
+
+
+class ImuFlag(IntFlag):
+    """What is wrong with one inertial sample; derived from the raw record by `decode_imu`."""
+
+    NONE = 0
+    GAP = 1
+    """No data: the read failed, or the slot was skipped because the one before ran over."""
+    LATE = 2
+    """The read began more than 2 ms after its slot; the stamp is right, the spacing is not."""
+    REPEAT = 4
+    """All channels equal the sample before: the sensor had nothing new (its clock beats with ours)."""
+    STUCK = 8
+    """Equal for at least ten slots: the sensor no longer measures. Values are NaN."""
+    BLANK = 16
+    """All registers 0x00 or 0xFF: a sensor in reset or off the bus. Values are NaN."""
+    ACC_CLIPPED = 32
+    """An accelerometer axis is at its range limit."""
+    GYRO_CLIPPED = 64
+    """A gyroscope axis is at its range limit."""
+    JUMP = 128
+    """A step that no brick makes, and back: corrupted bytes. Values are NaN."""
+    BAD_QUATERNION = 256
+    """The chip's quaternion is not of unit length: a torn or corrupted read. Values are NaN."""
+    MODE_CHANGED = 512
+    """The operation mode is not the one set: the sensor was reset. Values are NaN until it is right again."""
+
+
+UNUSABLE = (
+    ImuFlag.GAP | ImuFlag.STUCK | ImuFlag.BLANK | ImuFlag.JUMP | ImuFlag.BAD_QUATERNION | ImuFlag.MODE_CHANGED
+)
+
+_Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class ImuDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a stream's header and the manifest say of one sensor.
+
+    Attributes
+    ----------
+    name : str
+        As in the file name, ``imu_<name>.msgpack``.
+    chip_id : str
+        The sensor's unique id (page 1, 0x50..0x5F) as hex, or ``""`` where it could not be read.
+    opr_mode : int
+        Operation mode register, as 0x07 (AMG) or 0x0C (NDOF).
+    fusion : bool
+        Whether the chip's own orientation outputs run in this mode.
+    acc_lsb_per_mps2, gyro_lsb_per_dps : float
+        Scales of the registers.
+    acc_range_g, gyro_range_dps : float
+        Where the channels clip.
+    period_ns, t0_ns : int, ns
+        The grid: slot n is due at ``t0_ns + n * period_ns``, CLOCK_MONOTONIC.
+    latency_ns : int, ns
+        Added to the middle of the transaction to give the sample time; negative for a filter's lag.
+    """
+
+    name: Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]{1,16}$")]
+    chip_id: str
+    bus: str
+    address: int
+    opr_mode: int
+    fusion: bool
+    acc_lsb_per_mps2: _Positive = 100.0
+    gyro_lsb_per_dps: _Positive = 16.0
+    acc_range_g: _Positive
+    gyro_range_dps: _Positive = 2000.0
+    period_ns: Annotated[int, msgspec.Meta(gt=0)]
+    t0_ns: int
+    latency_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ImuRecord:
+    """One slot as read; the fields are those of `IMU_SCHEMA`."""
+
+    slot: int
+    t_before_ns: int
+    t_after_ns: int
+    data: bytes | None
+    errno: int
+    status: bytes | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSamples:
+    """Inertial samples in units and in the sensor's axes, one row for every slot of the grid.
+
+    Attributes
+    ----------
+    t_ns : ndarray of int64, shape (n,)
+        Middle of the transaction plus latency; the due time where the slot is a gap.
+    acc_mps2, gyro_radps : ndarray, shape (n, 3)
+        NaN where `flags` says that the sample is not usable.
+    q_wxyz : ndarray, shape (n, 4)
+        The chip's own orientation; NaN unless a fusion mode runs.
+    temperature_degc : ndarray, shape (n,)
+    calibration : ndarray of uint8, shape (n,)
+        CALIB_STAT: system, gyroscope, accelerometer, magnetometer, two bits each.
+    flags : ndarray of int64, shape (n,), `ImuFlag`
+    """
+
+    t_ns: IntArray
+    acc_mps2: FloatArray
+    gyro_radps: FloatArray
+    q_wxyz: FloatArray
+    temperature_degc: FloatArray
+    calibration: NDArray[np.uint8]
+    flags: IntArray
+
+
+def write_imu(file: BinaryIO, description: ImuDescription, records: Iterable[ImuRecord]) -> int:
+    """Write one sensor's stream to an open file; return the number of records."""
+    rows = ((r.slot, r.t_before_ns, r.t_after_ns, r.data, r.errno, r.status) for r in records)
+    return write_stream(file, IMU_SCHEMA, rows, meta=msgspec.to_builtins(description))
+
+
+def read_imu(path: Path) -> tuple[ImuDescription, list[ImuRecord], int]:
+    """Return a sensor's description, its records and the bytes left over after the last whole one.
+
+    Raises
+    ------
+    RunFormatError
+        If it is no inertial stream, or slots do not increase.
+    """
+    contents = read_stream(path, IMU_SCHEMA)
+    description = convert(contents.meta, ImuDescription, where=f"{path}: header", error=RunFormatError)
+    columns = (contents.columns[f.name] for f in IMU_SCHEMA.fields)
+    records = [ImuRecord(*row) for row in zip(*columns, strict=True)]
+    for i, record in enumerate(records):
+        if i and record.slot <= records[i - 1].slot:
+            raise RunFormatError(
+                f"{path}: slot {record.slot} of record {i} does not come after the one before"
+            )
+        if record.data is not None and len(record.data) != N_DATA_BYTES:
+            raise RunFormatError(f"{path}: record {i}: {len(record.data)} bytes; expected {N_DATA_BYTES}")
+    return description, records, contents.leftover_bytes
+
+
+def decode_imu(description: ImuDescription, records: list[ImuRecord]) -> ImuSamples:
+    """Turn raw registers into units, put gaps where slots are missing, and flag what cannot be trusted."""
+    if not records:
+        empty = np.empty((0, 3))
+        zero = np.empty(0, dtype=np.int64)
+        return ImuSamples(
+            zero, empty, empty.copy(), np.empty((0, 4)), np.empty(0), np.empty(0, np.uint8), zero.copy()
+        )
+    first = records[0].slot
+    n = records[-1].slot - first + 1
+    if n > 50 * len(records) + 100_000:
+        raise RunFormatError(
+            f"imu {description.name}: {len(records)} records over {n} slots; the grid is damaged"
+        )
+    t_due = description.t0_ns + (first + np.arange(n, dtype=np.int64)) * description.period_ns
+    t_ns = t_due.copy()
+    raw = np.zeros((n, N_DATA_BYTES), dtype=np.uint8)
+    flags = np.full(n, int(ImuFlag.GAP), dtype=np.int64)
+    mode_wrong = np.zeros(n, dtype=np.bool_)
+    wrong = False
+    for record in records:
+        i = record.slot - first
+        if record.status is not None and len(record.status) == 3:
+            wrong = record.status[2] != description.opr_mode
+        mode_wrong[i:] = wrong
+        if record.data is not None:
+            raw[i] = np.frombuffer(record.data, dtype=np.uint8)
+            t_ns[i] = (record.t_before_ns + record.t_after_ns) // 2 + description.latency_ns
+            late = record.t_before_ns - t_due[i] > 2_000_000
+            flags[i] = int(ImuFlag.LATE) if late else 0
+    words = raw.view("<i2").astype(np.float64)  # 23 words from register 0x08
+    acc = words[:, 0:3] / description.acc_lsb_per_mps2
+    gyro_dps = words[:, 6:9] / description.gyro_lsb_per_dps
+    q = words[:, 12:16] / 16384.0
+    present = flags & ImuFlag.GAP == 0
+
+    flags[present & ((raw[:, :18] == 0).all(axis=1) | (raw == 0xFF).all(axis=1))] |= int(ImuFlag.BLANK)
+    # Temperature and calibration status change on their own time: repeats are judged on the measurements.
+    same = np.zeros(n, dtype=np.bool_)
+    same[1:] = present[1:] & present[:-1] & (raw[1:, :44] == raw[:-1, :44]).all(axis=1)
+    flags[same] |= int(ImuFlag.REPEAT)
+    flags[_in_runs_of_at_least(same, 9)] |= int(ImuFlag.STUCK)
+    limit = description.acc_range_g * STANDARD_GRAVITY_MPS2 * 0.995
+    flags[present & (np.abs(acc) >= limit).any(axis=1)] |= int(ImuFlag.ACC_CLIPPED)
+    flags[present & (np.abs(gyro_dps) >= description.gyro_range_dps * 0.998).any(axis=1)] |= int(
+        ImuFlag.GYRO_CLIPPED
+    )
+    gyro = np.deg2rad(gyro_dps)
+    flags[_spikes(acc, present, _MAX_ACC_STEP_MPS2) | _spikes(gyro, present, _MAX_GYRO_STEP_RADPS)] |= int(
+        ImuFlag.JUMP
+    )
+    if description.fusion:
+        norm = np.linalg.norm(q, axis=1)
+        flags[present & (np.abs(norm - 1) > 0.01)] |= int(ImuFlag.BAD_QUATERNION)
+    flags[mode_wrong] |= int(ImuFlag.MODE_CHANGED)
+
+    bad = flags & int(UNUSABLE) != 0
+    acc[bad], gyro[bad], q[bad] = np.nan, np.nan, np.nan
+    if not description.fusion:
+        q[:] = np.nan
+    temperature = raw[:, 0x34 - FIRST_REGISTER].view(np.int8).astype(np.float64)
+    temperature[~present] = np.nan
+    return ImuSamples(t_ns, acc, gyro, q, temperature, raw[:, 0x35 - FIRST_REGISTER].copy(), flags)
+
+
+def _in_runs_of_at_least(mask: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
+    edges = np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))
+    out = np.zeros_like(mask)
+    for start, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        if end - start >= length:
+            out[start:end] = True
+    return out
+
+
+def _spikes(values: FloatArray, present: NDArray[np.bool_], limit: float) -> NDArray[np.bool_]:
+    """Mark single samples that leave both neighbours by more than ``limit`` in the same direction."""
+    out = np.zeros(len(values), dtype=np.bool_)
+    if len(values) >= 3:
+        up, down = values[1:-1] - values[:-2], values[1:-1] - values[2:]
+        jump = (np.sign(up) == np.sign(down)) & (np.minimum(np.abs(up), np.abs(down)) > limit)
+        out[1:-1] = jump.any(axis=1) & present[1:-1] & present[:-2] & present[2:]
+    return out

@@ -1,0 +1,255 @@
+"""The wire protocol's messages, as types that are checked before anything believes them.
+
+A message is one msgpack map ``{"protocol": 1, "request_id": n, "body": {"type": ..., ...}}``; file bytes
+travel behind it as a raw ZeroMQ frame, never inside. `docs/wire-protocol.md` describes each message.
+"""
+
+from typing import Annotated, Literal, TypeVar
+
+import msgpack
+import msgspec
+
+from bricktrack_common.clocks import ClockTriplet
+from bricktrack_common.errors import ProtocolError
+from bricktrack_common.run_manifest import FILE_NAME_PATTERN, RUN_ID_PATTERN
+from bricktrack_common.typed_data import convert
+
+PROTOCOL_VERSION = 1
+MAX_HEADER_BYTES = 64 * 1024
+MAX_CHUNK_BYTES = 1024 * 1024
+DEFAULT_PORT = 41733
+
+_RunId = Annotated[str, msgspec.Meta(pattern=RUN_ID_PATTERN)]
+_Label = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,32}$")]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+_Words = Annotated[str, msgspec.Meta(max_length=2000)]
+_Sha256 = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}$")]
+
+DaemonState = Literal["idle", "armed", "recording", "saving", "fault"]
+ErrorCode = Literal[
+    "bad-message", "bad-version", "busy", "no-such-run", "no-such-file", "out-of-range", "hash-mismatch",
+    "no-space", "not-ready", "wrong-state", "internal",
+]  # fmt: skip
+
+
+class _Body(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag=str.lower
+):
+    """Base of all bodies; the type's name in lower case is its tag."""
+
+
+# Requests, host to unit.
+
+
+class Hello(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="hello"):
+    """Ask who is there."""
+
+    software: _Words
+
+
+class GetStatus(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="status"):
+    """Ask how the unit is."""
+
+
+class Arm(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="arm"):
+    """Get ready to record at the next first edge; answered when the unit *is* ready.
+
+    ``label`` becomes part of the run id; ``duration_s`` overrides the unit's configuration.
+    """
+
+    label: _Label = ""
+    duration_s: Annotated[float, msgspec.Meta(gt=0, le=600)] | None = None
+
+
+class Disarm(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="disarm"):
+    """Go back to idle without a run; also clears a fault."""
+
+
+class ListRuns(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="list"):
+    """Ask for the runs on the card."""
+
+
+class DescribeRun(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="describe"):
+    """Ask for one run's files, with sizes and hashes; the manifest itself is file 0."""
+
+    run_id: _RunId
+
+
+class Read(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="read"):
+    """Ask for a chunk of a file, by the run's id and the file's index; never by a path."""
+
+    run_id: _RunId
+    file_index: _Count
+    offset: _Count
+    length: Annotated[int, msgspec.Meta(ge=1, le=MAX_CHUNK_BYTES)]
+
+
+class Confirm(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="confirm"):
+    """Tell the unit that the host holds these files, verified and synced to its disk."""
+
+    run_id: _RunId
+    sha256: Annotated[list[_Sha256], msgspec.Meta(max_length=64)]
+
+
+Request = Hello | GetStatus | Arm | Disarm | ListRuns | DescribeRun | Read | Confirm
+
+
+# Replies, unit to host.
+
+
+class HelloReply(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="hello-reply"):
+    """Who is there."""
+
+    unit: _RunId
+    software: _Words
+    simulated: bool
+
+
+class ImuStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How one inertial sensor is."""
+
+    name: str
+    samples: _Count
+    gaps: _Count
+    calibration: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None
+    problem: _Words = ""
+
+
+class StatusReply(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="status-reply"):
+    """How the unit is."""
+
+    unit: _RunId
+    state: DaemonState
+    reason: _Words = ""
+    run_id: str = ""
+    runs: _Count
+    disk_free_bytes: _Count
+    disk_needed_bytes: _Count
+    frames: _Count
+    frame_age_ms: float | None = None
+    imus: list[ImuStatus]
+    edges: _Count
+    line_is_high: bool | None = None
+    temperature_degc: float | None = None
+    last_error: _Words = ""
+    clocks: ClockTriplet
+
+
+class Armed(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="armed"):
+    """The unit is ready; the run will have this id."""
+
+    run_id: _RunId
+    missing: list[_Words]
+
+
+class Disarmed(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="disarmed"):
+    """The unit is idle."""
+
+
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One run on the card."""
+
+    run_id: _RunId
+    state: Literal["complete", "interrupted"]
+    n_bytes: _Count
+    confirmed: bool
+
+
+class RunList(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="run-list"):
+    """The runs on the card, oldest first."""
+
+    runs: Annotated[list[RunSummary], msgspec.Meta(max_length=10_000)]
+
+
+class FileSummary(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One file of a run; its place in the list is its index."""
+
+    name: Annotated[str, msgspec.Meta(pattern=FILE_NAME_PATTERN)]
+    n_bytes: _Count
+    sha256: _Sha256
+
+
+class RunDescription(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="run-description"):
+    """The files of a run; index 0 is the manifest."""
+
+    run_id: _RunId
+    files: Annotated[list[FileSummary], msgspec.Meta(min_length=1, max_length=64)]
+
+
+class Chunk(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="chunk"):
+    """A chunk of a file; its bytes are the next frame of the message."""
+
+    run_id: _RunId
+    file_index: _Count
+    offset: _Count
+    n_bytes: _Count
+    crc32: Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
+
+
+class Confirmed(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="confirmed"):
+    """The unit has noted that the host holds the run."""
+
+    run_id: _RunId
+
+
+class Refusal(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="refusal"):
+    """The unit does not do what was asked, and says why."""
+
+    code: ErrorCode
+    message: _Words
+
+
+Reply = HelloReply | StatusReply | Armed | Disarmed | RunList | RunDescription | Chunk | Confirmed | Refusal
+
+_Body_T = TypeVar("_Body_T")
+
+
+class _RequestEnvelope(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    protocol: int
+    request_id: _Count
+    body: Request
+
+
+class _ReplyEnvelope(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    protocol: int
+    request_id: _Count
+    body: Reply
+
+
+def encode_message(request_id: int, body: Request | Reply) -> bytes:
+    """Return the msgpack header of one request or reply."""
+    envelope = {"protocol": PROTOCOL_VERSION, "request_id": request_id, "body": msgspec.to_builtins(body)}
+    packed: bytes = msgpack.packb(envelope)
+    return packed
+
+
+def decode_request(data: bytes) -> tuple[int, Request]:
+    """Return the id and body of a request; raise `ProtocolError` on anything else."""
+    envelope = _decode(data, _RequestEnvelope)
+    return envelope.request_id, envelope.body
+
+
+def decode_reply(data: bytes) -> tuple[int, Reply]:
+    """Return the id and body of a reply; raise `ProtocolError` on anything else."""
+    envelope = _decode(data, _ReplyEnvelope)
+    return envelope.request_id, envelope.body
+
+
+class VersionError(ProtocolError):
+    """The other side speaks another version of the protocol."""
+
+
+def _decode(data: bytes, kind: type[_Body_T]) -> _Body_T:
+    if len(data) > MAX_HEADER_BYTES and kind is _RequestEnvelope:
+        raise ProtocolError(f"message header of {len(data)} bytes; at most {MAX_HEADER_BYTES} are allowed")
+    try:
+        value = msgpack.unpackb(data, raw=False, strict_map_key=True, max_ext_len=0)
+    except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as e:
+        raise ProtocolError(f"not a message of this protocol: {type(e).__name__}: {e}") from e
+    if not isinstance(value, dict) or not isinstance(value.get("protocol"), int):
+        raise ProtocolError("not a message of this protocol: no version number")
+    if value["protocol"] != PROTOCOL_VERSION:
+        raise VersionError(
+            f"protocol version {value['protocol']}; this bricktrack speaks version {PROTOCOL_VERSION}"
+        )
+    return convert(value, kind, where="message", error=ProtocolError)
