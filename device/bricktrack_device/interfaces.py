@@ -1,4 +1,4 @@
-"""What the daemon needs of the hardware: small protocols that the real parts and the simulated ones both meet."""
+"""What the daemon needs of the hardware: protocols that the real parts and the simulated ones both meet."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
