@@ -1,0 +1,49 @@
+# Each target makes what it needs: the first one builds .venv with the versions of constraints.txt.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: demo test check bench docs format constraints clean help
+
+help:  ## show this list
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "bricktrack needs Python 3.11 or newer; $(PYTHON) is older. Try: make PYTHON=python3.11"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+	    -e '.[device,sim,host]' --group dev
+	@touch $@
+
+demo: $(READY)  ## record a simulated brick with the real daemon, pull it, process it, open the report
+	$(BIN)/bricktrack demo --folder demo
+
+test: $(READY)  ## all tests
+	$(BIN)/python -m pytest
+
+check: $(READY)  ## formatting, lint, import contracts, types, documentation
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports
+	$(BIN)/mypy
+	$(BIN)/sphinx-build -q -W -b html docs docs/_build/html
+
+bench: $(READY)  ## measure speed and accuracy; ratios are taken side by side in one run
+	$(BIN)/python scripts/bench.py
+
+docs: $(READY)  ## build the documentation into docs/_build/html
+	$(BIN)/sphinx-build -W -b html docs docs/_build/html
+
+format: $(READY)  ## put the code into its form
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+constraints: $(READY)  ## write down the versions that are installed now
+	{ echo '# Versions that are tested together. Refresh with: make constraints'; \
+	  $(BIN)/python -m pip freeze --exclude-editable --exclude pip --exclude setuptools; } > constraints.txt
+
+clean:  ## remove what the other targets made
+	rm -rf $(VENV) demo docs/_build build dist
