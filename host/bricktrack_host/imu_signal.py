@@ -1,0 +1,270 @@
+"""Inertial samples as continuous signals: splines, how far to trust them, and motion increments between instants.
+
+Times inside are seconds after `ImuSignal.epoch_ns` on the clock of the samples. "Roughness" is what a sample
+differs from the cubic through its neighbours: noise, or motion faster than the sample rate can follow.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PPoly
+from scipy.ndimage import maximum_filter1d
+
+from bricktrack_common.arrays import BoolArray, FloatArray, as_float_array
+from bricktrack_common.errors import ShapeError
+from bricktrack_common.imu_records import UNUSABLE, ImuFlag
+from bricktrack_common.rotations import matrix_from_rvec
+from bricktrack_host.tracks import ImuTrack
+
+MIN_SAMPLES = 20
+_GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
+_BRIDGE_PERIODS = 3.5  # up to here the cubic may bridge it; beyond, a straight line
+_SUBSTEPS = 4  # of at most 2.5 ms at 100 Hz: cubic signal, exact integrals, coning left below 1e-8 rad
+_PREDICTION_GAIN = 1.394  # sd of (sample - cubic through four neighbours) over sd of one sample, white noise
+_CLIP_SHARE = 0.98  # of the range: filters inside the chip round a clipped peak off a little
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Increments:
+    """What the samples say of the motion from one instant to another, in body axes at the first.
+
+    Attributes
+    ----------
+    R : ndarray, shape (n, 3, 3)
+        Body at the end seen from body at the start.
+    dv_mps, dp_m : ndarray, shape (n, 3)
+        Integral, and double integral, of the specific force.
+    R_half : ndarray, shape (n, 3, 3)
+        Body half-way seen from body at the start.
+    f_rate_mps3 : ndarray, shape (n, 3)
+        Mean rate of change of the specific force, as measured.
+    """
+
+    R: FloatArray
+    dv_mps: FloatArray
+    dp_m: FloatArray
+    R_half: FloatArray
+    f_rate_mps3: FloatArray
+
+
+def _usable(imu: ImuTrack) -> BoolArray:
+    bad = UNUSABLE | ImuFlag.REPEAT  # a repeat is an old measurement under a new stamp
+    whole = np.isfinite(imu.acc_mps2).all(axis=1) & np.isfinite(imu.gyro_radps).all(axis=1)
+    return np.asarray(whole & ((imu.flags & int(bad)) == 0))
+
+
+def roughness(values: FloatArray, *, window: int = 5) -> FloatArray:
+    """Return how far samples lie from the cubic through their four neighbours, as an sd of one sample.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n, 3), n >= 5
+    window : int
+        The greatest over this many samples and over the axes is taken.
+
+    Returns
+    -------
+    sd : ndarray, shape (n,), unit of ``values``
+        White noise of sd s gives about 2 s (the greatest of 15); a smooth signal nearly 0.
+    """
+    v = as_float_array("values", values, (None, 3))
+    padded = np.concatenate([v[:1].repeat(2, 0), v, v[-1:].repeat(2, 0)])
+    predicted = (4 * (padded[1:-3] + padded[3:-1]) - padded[:-4] - padded[4:]) / 6
+    sd = np.abs(v - predicted).max(axis=1) / _PREDICTION_GAIN
+    sd[[0, 1, -2, -1]] = sd[[2, 2, -3, -3]]  # the padding is no neighbour
+    return np.asarray(maximum_filter1d(sd, window, mode="nearest"))
+
+
+def _bridge_clipped(t_s: FloatArray, acc: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
+    """Return samples with clipped peaks completed by the cubic of the others, and how unsure they are."""
+    done, sd = acc.copy(), np.zeros(len(acc))
+    for axis in range(3):
+        clipped = np.abs(acc[:, axis]) >= _CLIP_SHARE * limit
+        if not clipped.any() or (~clipped).sum() < 4:
+            sd[clipped] = limit
+            continue
+        bridge = CubicSpline(t_s[~clipped], acc[~clipped, axis])(t_s[clipped])
+        sign = np.sign(acc[clipped, axis])
+        # The truth lies beyond the limit; a cubic over a long clipped stretch can fly off, so it is bounded.
+        excess = np.clip(sign * bridge - limit, 0.0, limit)
+        done[clipped, axis] = sign * (limit + excess)
+        sd[clipped] = np.maximum(sd[clipped], 0.1 * limit + 0.5 * excess)
+    return done, np.asarray(maximum_filter1d(sd, 3, mode="nearest"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSignal:
+    """Angular rate and specific force of one run as cubic splines of time.
+
+    Attributes
+    ----------
+    epoch_ns : int
+        Zero of the seconds below, on the samples' clock.
+    period_s : float
+        Median sample interval.
+    t_s : ndarray, shape (n,)
+        Instants of the samples that are used.
+    gyro_radps, acc_mps2 : ndarray, shape (n, 3)
+        Those samples; clipped accelerations completed by the cubic of their neighbours.
+    gyro_roughness_radps, acc_roughness_mps2 : ndarray, shape (n,)
+        See `roughness`.
+    clip_sd_mps2 : ndarray, shape (n,)
+        Above zero where a sample was clipped or stands beside one.
+    gaps_s : ndarray, shape (n_gaps, 2)
+        From the last sample before to the first after each interval with missing samples.
+    """
+
+    epoch_ns: int
+    period_s: float
+    t_s: FloatArray
+    gyro_radps: FloatArray
+    acc_mps2: FloatArray
+    gyro_roughness_radps: FloatArray
+    acc_roughness_mps2: FloatArray
+    clip_sd_mps2: FloatArray
+    gaps_s: FloatArray
+    _gyro: CubicSpline[Any]
+    _acc: CubicSpline[Any]
+    _gyro_integral: PPoly[Any]
+    _acc_integral: PPoly[Any]
+
+    @classmethod
+    def from_track(cls, imu: ImuTrack) -> "ImuSignal":
+        """Return the signals of a track; samples that are NaN, gaps or repeats are bridged.
+
+        Raises
+        ------
+        ShapeError
+            If fewer than `MIN_SAMPLES` samples can be used, or their stamps do not increase.
+        """
+        as_float_array("acc_mps2", imu.acc_mps2, (len(imu.t_ns), 3))
+        as_float_array("gyro_radps", imu.gyro_radps, (len(imu.t_ns), 3))
+        use = _usable(imu)
+        if use.sum() < MIN_SAMPLES:
+            raise ShapeError(
+                f"only {use.sum()} of {use.size} inertial samples are whole; at least {MIN_SAMPLES} are needed. "
+                "Process the run with the camera alone."
+            )
+        t_ns = imu.t_ns[use]
+        if (np.diff(t_ns) <= 0).any():
+            i = int(np.argmax(np.diff(t_ns) <= 0))
+            raise ShapeError(
+                f"inertial stamps do not increase: {t_ns[i]} ns is followed by {t_ns[i + 1]} ns; sort the samples"
+            )
+        epoch_ns = int(t_ns[0])
+        t_s = (t_ns - epoch_ns) * 1e-9
+        period_s = float(np.median(np.diff(t_s)))
+        clip_limit = imu.acc_range_mps2 if imu.acc_range_mps2 > 0 else np.inf
+        acc, clip_sd = _bridge_clipped(t_s, imu.acc_mps2[use], clip_limit)
+        gyro = imu.gyro_radps[use]
+
+        interval = np.diff(t_s)
+        missing = np.flatnonzero(interval > _GAP_PERIODS * period_s)
+        knots, knot_gyro, knot_acc = t_s, gyro, acc
+        for i in missing[interval[missing] > _BRIDGE_PERIODS * period_s][::-1]:
+            # Points on the chord keep the cubic from swinging across a long gap.
+            n_fill = int(np.ceil(interval[i] / period_s)) - 1
+            share = np.arange(1, n_fill + 1)[:, None] / (n_fill + 1)
+            knots = np.insert(knots, i + 1, t_s[i] + share[:, 0] * interval[i])
+            knot_gyro = np.insert(knot_gyro, i + 1, gyro[i] + share * (gyro[i + 1] - gyro[i]), axis=0)
+            knot_acc = np.insert(knot_acc, i + 1, acc[i] + share * (acc[i + 1] - acc[i]), axis=0)
+        gyro_spline, acc_spline = CubicSpline(knots, knot_gyro), CubicSpline(knots, knot_acc)
+        return cls(
+            epoch_ns=epoch_ns,
+            period_s=period_s,
+            t_s=t_s,
+            gyro_radps=gyro,
+            acc_mps2=acc,
+            gyro_roughness_radps=roughness(gyro),
+            acc_roughness_mps2=roughness(acc),
+            clip_sd_mps2=clip_sd,
+            gaps_s=np.stack([t_s[missing], t_s[missing + 1]], axis=1),
+            _gyro=gyro_spline,
+            _acc=acc_spline,
+            _gyro_integral=gyro_spline.antiderivative(),
+            _acc_integral=acc_spline.antiderivative(),
+        )
+
+    def _held(self, t_s: FloatArray) -> FloatArray:
+        return np.clip(t_s, self.t_s[0], self.t_s[-1])
+
+    def gyro_at(self, t_s: FloatArray) -> FloatArray:
+        """Return the measured angular rate, rad/s; held beyond the first and last sample."""
+        return np.asarray(self._gyro(self._held(t_s)))
+
+    def acc_at(self, t_s: FloatArray) -> FloatArray:
+        """Return the measured specific force, m/s^2; held beyond the first and last sample."""
+        return np.asarray(self._acc(self._held(t_s)))
+
+    def _integral(self, integral: PPoly[Any], spline: CubicSpline[Any], t_s: FloatArray) -> FloatArray:
+        held = self._held(t_s)
+        return np.asarray(integral(held) + spline(held) * (t_s - held)[..., None])
+
+    def angle_at(self, t_s: FloatArray) -> FloatArray:
+        """Return the integral of the measured angular rate, component by component, rad."""
+        return self._integral(self._gyro_integral, self._gyro, t_s)
+
+    def in_gap(self, t_s: FloatArray) -> BoolArray:
+        """Return which instants lie where samples are missing, or beyond the samples."""
+        outside = (t_s < self.t_s[0] - self.period_s) | (t_s > self.t_s[-1] + self.period_s)
+        if len(self.gaps_s):
+            i = np.searchsorted(self.gaps_s[:, 0], t_s, side="left") - 1
+            outside |= (i >= 0) & (t_s < self.gaps_s[np.maximum(i, 0), 1])
+        return np.asarray(outside)
+
+    def increments(
+        self,
+        start_s: FloatArray,
+        end_s: FloatArray,
+        *,
+        gyro_bias_radps: FloatArray,
+        acc_bias_mps2: FloatArray,
+        acc_lag_s: float,
+    ) -> Increments:
+        """Return the motion between pairs of instants, by exact integrals of the splines over short sub-steps.
+
+        Parameters
+        ----------
+        start_s, end_s : ndarray, shape (n,)
+            Any pairs a sample interval or less apart (longer ones lose accuracy).
+        gyro_bias_radps, acc_bias_mps2 : ndarray, shape (3,) or (n, 3)
+        acc_lag_s : float
+            Specific force at t is the sample stamped t + this (DESIGN 8.2).
+        """
+        bg = np.broadcast_to(gyro_bias_radps, (len(start_s), 3))
+        ba = np.broadcast_to(acc_bias_mps2, (len(start_s), 3))
+        dt = (end_s - start_s)[:, None]
+        # Rows: instants; columns: the ends and middles of the sub-steps.
+        grid = start_s[:, None] + dt * np.linspace(0.0, 1.0, 2 * _SUBSTEPS + 1)
+        angle = self.angle_at(grid)
+        angle = angle - angle[:, :1] - bg[:, None] * (grid - grid[:, :1])[..., None]
+        velocity = np.diff(self._integral(self._acc_integral, self._acc, grid[:, ::2] + acc_lag_s), axis=1)
+        velocity = velocity - ba[:, None] * (dt / _SUBSTEPS)[..., None]
+        h = dt / _SUBSTEPS
+
+        R = np.broadcast_to(np.eye(3), (len(start_s), 3, 3))
+        R_half = R
+        dv, dp = np.zeros((len(start_s), 3)), np.zeros((len(start_s), 3))
+        half = matrix_from_rvec(np.diff(angle, axis=1))  # rotations over half sub-steps
+        for i in range(_SUBSTEPS):
+            step = np.einsum("nij,njk,nk->ni", R, half[:, 2 * i], velocity[:, i])
+            dp = dp + dv * h + 0.5 * step * h
+            dv = dv + step
+            R = R @ half[:, 2 * i] @ half[:, 2 * i + 1]
+            if 2 * (i + 1) == _SUBSTEPS:
+                R_half = R
+        safe = np.where(dt == 0, 1.0, dt)
+        ends = self.acc_at(np.stack([start_s, end_s]) + acc_lag_s)
+        rate = np.where(dt == 0, 0.0, (ends[1] - ends[0]) / safe)
+        return Increments(R=R, dv_mps=dv, dp_m=dp, R_half=R_half, f_rate_mps3=rate)
+
+
+def chain_rotations(steps: FloatArray) -> FloatArray:
+    """Return the running products ``steps[0] @ ... @ steps[i]``, shape (n, 3, 3), in log2(n) passes."""
+    R = np.array(steps)
+    shift = 1
+    while shift < len(R):
+        R[shift:] = R[:-shift] @ R[shift:]
+        shift *= 2
+    return R
