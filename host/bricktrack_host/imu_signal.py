@@ -1,4 +1,4 @@
-"""Inertial samples as continuous signals: splines, how far to trust them, and motion increments between instants.
+"""Inertial samples as continuous signals: splines, how far to trust them, and motion between instants.
 
 Times inside are seconds after `ImuSignal.epoch_ns` on the clock of the samples. "Roughness" is what a sample
 differs from the cubic through its neighbours: noise, or motion faster than the sample rate can follow.
@@ -143,14 +143,15 @@ class ImuSignal:
         use = _usable(imu)
         if use.sum() < MIN_SAMPLES:
             raise ShapeError(
-                f"only {use.sum()} of {use.size} inertial samples are whole; at least {MIN_SAMPLES} are needed. "
-                "Process the run with the camera alone."
+                f"only {use.sum()} of {use.size} inertial samples are whole; at least {MIN_SAMPLES} are "
+                "needed. Process the run with the camera alone."
             )
         t_ns = imu.t_ns[use]
         if (np.diff(t_ns) <= 0).any():
             i = int(np.argmax(np.diff(t_ns) <= 0))
             raise ShapeError(
-                f"inertial stamps do not increase: {t_ns[i]} ns is followed by {t_ns[i + 1]} ns; sort the samples"
+                f"inertial stamps do not increase: {t_ns[i]} ns is followed by {t_ns[i + 1]} ns; "
+                "sort the samples"
             )
         epoch_ns = int(t_ns[0])
         t_s = (t_ns - epoch_ns) * 1e-9
@@ -222,7 +223,7 @@ class ImuSignal:
         acc_bias_mps2: FloatArray,
         acc_lag_s: float,
     ) -> Increments:
-        """Return the motion between pairs of instants, by exact integrals of the splines over short sub-steps.
+        """Return the motion between pairs of instants, by integrals of the splines over sub-steps.
 
         Parameters
         ----------

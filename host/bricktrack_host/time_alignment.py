@@ -169,9 +169,9 @@ def _correlate(
 class _RotationFit:
     """Least squares of optical attitudes against the integrated gyro, for offset, skew and slow drift.
 
-    The optical noise of neighbouring frame-to-frame rotations is anticorrelated. Whitened, their least squares
-    is that of the attitudes themselves less a slowly varying misalignment: hat functions every half second
-    for each axis, which take up start attitude, bias, gyro noise and scale error.
+    The optical noise of neighbouring frame-to-frame rotations is anticorrelated. Whitened, their least
+    squares is that of the attitudes themselves less a slowly varying misalignment: hat functions every half
+    second for each axis, which take up start attitude, bias, gyro noise and scale error.
     """
 
     def __init__(
@@ -304,9 +304,9 @@ def align_times(
 ) -> TimeAlignment:
     """Return how camera time maps to IMU time, from the rotations that both saw.
 
-    Coarse by correlation of angular rates, then by robust least squares of the optical attitudes against the
-    integrated gyro. A motion with too little rotation, or one so periodic that several offsets fit, gives back
-    the stamps' prior and says why.
+    Coarse by correlation of angular rates, then by robust least squares of the optical attitudes against
+    the integrated gyro. A motion with too little rotation, or one so periodic that several offsets fit,
+    gives back the stamps' prior and says why.
 
     Parameters
     ----------
@@ -394,7 +394,7 @@ def align_times(
     if vector < _MIN_VECTOR_CORRELATION:
         axes = speed > 0.8
         return from_stamps(
-            "the angular speeds agree but not their directions: the IMU's axes are not those of the layout file"
+            "the angular speeds agree, their directions do not: the IMU's axes are not the layout file's"
             if axes
             else f"the angular rates do not correlate (speed {speed:.2f}, vector {vector:.2f})",
             None,

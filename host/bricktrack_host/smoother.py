@@ -1,0 +1,311 @@
+"""Error-state Kalman filter on the manifold with a fixed-interval smoother, for a batch of runs at once.
+
+The equations are DESIGN 8.2's. SI units inside. Error state, 21 components: attitude (body axes), position and
+velocity of the IMU point (camera axes), gyro and accelerometer bias, gravity (camera axes), time offset, clock
+skew, accelerometer-minus-gyro lag. Arrays put time first and the runs of the batch second, so that each step of
+the one loop over time works on contiguous memory; a run shorter than the others is padded with empty steps.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
+
+N_STATES = 21
+ATT, POS, VEL, BG, BA, GRAV = (slice(3 * i, 3 * i + 3) for i in range(6))
+TAU, SKEW, LAG = 18, 19, 20
+CHI2_6_95 = 12.59  # 95 % point of chi-square with 6 degrees of freedom
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """All that the filter needs of a batch; K nodes, B runs.
+
+    Attributes
+    ----------
+    dt_s : ndarray, shape (K - 1, B)
+        Zero where a run is already over.
+    R_step, R_half : ndarray, shape (K - 1, B, 3, 3)
+    dv_mps, dp_m, f_rate_mps3 : ndarray, shape (K - 1, B, 3)
+        Increments at the linearisation point of biases and lag, see `imu_signal.Increments`.
+    gyro_var, acc_var : ndarray, shape (K - 1, B), rad^2/s and m^2/s^3
+        Spectral densities of the inertial noise.
+    gyro_bias_walk, acc_bias_walk : ndarray, shape (K - 1, B), rad^2/s^3 and m^2/s^5
+    omega_radps : ndarray, shape (K, B, 3)
+        Measured angular rate at the nodes.
+    has_frame : ndarray of bool, shape (K, B)
+    R_seen, p_seen_m, cov_seen : ndarray, shape (K, B, 3, 3), (K, B, 3), (K, B, 6, 6)
+        Optical poses of the brick's origin; covariance of [dtheta rad, dt m].
+    since_mid_s : ndarray, shape (K, B)
+        Camera time of the frame less that of the run's middle.
+    lever_arm_m : ndarray, shape (B, 3)
+    bg_lin, ba_lin : ndarray, shape (B, 3)
+    tau_lin, skew_lin, lag_lin : ndarray, shape (B,)
+        Where increments and node times were taken.
+    start : State
+    P_start : ndarray, shape (B, 21, 21)
+    """
+
+    dt_s: FloatArray
+    R_step: FloatArray
+    R_half: FloatArray
+    dv_mps: FloatArray
+    dp_m: FloatArray
+    f_rate_mps3: FloatArray
+    gyro_var: FloatArray
+    acc_var: FloatArray
+    gyro_bias_walk: FloatArray
+    acc_bias_walk: FloatArray
+    omega_radps: FloatArray
+    has_frame: BoolArray
+    R_seen: FloatArray
+    p_seen_m: FloatArray
+    cov_seen: FloatArray
+    since_mid_s: FloatArray
+    lever_arm_m: FloatArray
+    bg_lin: FloatArray
+    ba_lin: FloatArray
+    tau_lin: FloatArray
+    skew_lin: FloatArray
+    lag_lin: FloatArray
+    start: "State"
+    P_start: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Attitude and the 18 additive components, for any leading shape.
+
+    Attributes
+    ----------
+    R : ndarray, shape (..., 3, 3)
+    x : ndarray, shape (..., 21)
+        By the error state's indices; the attitude's three stay zero.
+    """
+
+    R: FloatArray
+    x: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """States at all nodes with covariance.
+
+    Attributes
+    ----------
+    state : State, leading shape (K, B)
+    covariance : ndarray, shape (K, B, 21, 21)
+    nis : ndarray, shape (K, B)
+        Innovation squared over its covariance (6 degrees of freedom), NaN where no frame; only of the filter.
+    """
+
+    state: State
+    covariance: FloatArray
+    nis: FloatArray
+
+
+def _matvec(A: FloatArray, v: FloatArray) -> FloatArray:
+    return np.asarray((A @ v[..., None])[..., 0])
+
+
+def _small_rvec(R: FloatArray) -> FloatArray:
+    """Return rotation vectors of rotations well below 90 degrees, cheaply."""
+    v = 0.5 * np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
+    )
+    s2 = np.minimum((v * v).sum(axis=-1, keepdims=True), 1.0)
+    return np.asarray(v * (1 + s2 / 6 + 0.075 * s2 * s2))
+
+
+def _move(state: State, dx: FloatArray) -> State:
+    x = state.x + dx
+    x[..., ATT] = 0.0
+    return State(state.R @ matrix_from_rvec(dx[..., ATT]), x)
+
+
+def observe(
+    state: State,
+    omega_radps: FloatArray,
+    lever_arm_m: FloatArray,
+    since_mid_s: FloatArray,
+    dt_s: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what a frame shows: attitude and origin of the brick, and the Jacobian of their errors.
+
+    Parameters
+    ----------
+    state : State, leading shape (...)
+        At the node; the frame lies ``dt_s`` later by the present estimate of offset and skew.
+    omega_radps : ndarray, shape (..., 3)
+        Angular rate less bias.
+
+    Returns
+    -------
+    R, p_m, H : ndarray, shape (..., 3, 3), (..., 3), (..., 6, 21)
+    """
+    arm = _matvec(state.R, np.broadcast_to(lever_arm_m, omega_radps.shape))
+    v_origin = state.x[..., VEL] - _matvec(state.R, np.cross(omega_radps, lever_arm_m))
+    H = np.zeros((*omega_radps.shape[:-1], 6, N_STATES))
+    eye = np.eye(3)
+    H[..., :3, ATT] = eye
+    H[..., :3, TAU] = omega_radps
+    H[..., :3, SKEW] = omega_radps * since_mid_s[..., None]
+    H[..., 3:, ATT] = state.R @ skew(np.broadcast_to(lever_arm_m, omega_radps.shape))
+    H[..., 3:, POS] = eye
+    H[..., 3:, TAU] = v_origin
+    H[..., 3:, SKEW] = v_origin * since_mid_s[..., None]
+    R = state.R @ matrix_from_rvec(omega_radps * dt_s[..., None])
+    return R, np.asarray(state.x[..., POS] - arm + v_origin * dt_s[..., None]), H
+
+
+def residuals(problem: Problem, state: State, at: IntArray, b: int) -> tuple[FloatArray, FloatArray]:
+    """Return optical residuals, shape (n, 6), and Jacobians, shape (n, 6, 21), at nodes of one run."""
+    R_at, x = state.R[at, b], state.x[at, b]
+    since_mid = problem.since_mid_s[at, b]
+    dt = (x[:, TAU] - problem.tau_lin[b]) + since_mid * (x[:, SKEW] - problem.skew_lin[b])
+    omega = problem.omega_radps[at, b] - x[:, BG]
+    R, p, H = observe(State(R_at, x), omega, problem.lever_arm_m[b], since_mid, dt)
+    turn = rvec_from_matrix(np.swapaxes(R, -1, -2) @ problem.R_seen[at, b])
+    return np.concatenate([turn, problem.p_seen_m[at, b] - p], axis=-1), H
+
+
+def _process_noise(problem: Problem) -> FloatArray:
+    dt = problem.dt_s
+    Q = np.zeros((*dt.shape, N_STATES, N_STATES))
+    i = np.arange(3)
+    Q[..., i, i] = (problem.gyro_var * dt)[..., None]
+    Q[..., 6 + i, 6 + i] = (problem.acc_var * dt)[..., None]
+    Q[..., 3 + i, 6 + i] = Q[..., 6 + i, 3 + i] = (problem.acc_var * dt**2 / 2)[..., None]
+    Q[..., 3 + i, 3 + i] = (problem.acc_var * dt**3 / 3)[..., None]
+    Q[..., 9 + i, 9 + i] = (problem.gyro_bias_walk * dt)[..., None]
+    Q[..., 12 + i, 12 + i] = (problem.acc_bias_walk * dt)[..., None]
+    return Q
+
+
+def _sensitivities(problem: Problem) -> FloatArray:
+    """Return, in body axes, what changes dv: attitude, accelerometer bias, lag; and then the same for dp.
+
+    Shape (K - 1, B, 6, 7): rows dv, dp; columns theta (3), ba (3), lag.
+    """
+    dt = problem.dt_s[..., None, None]
+    out = np.zeros((*problem.dt_s.shape, 6, 7))
+    rate = _matvec(problem.R_half, problem.f_rate_mps3)[..., None]
+    out[..., :3, :3] = -skew(problem.dv_mps)
+    out[..., 3:, :3] = -skew(problem.dp_m)
+    out[..., :3, 3:6] = -problem.R_half * dt
+    out[..., 3:, 3:6] = -problem.R_half * dt**2 / 2
+    out[..., :3, 6:] = rate * dt
+    out[..., 3:, 6:] = rate * dt**2 / 2
+    return out
+
+
+class Filter:
+    """The forward pass, kept whole so that the smoother can run back over it."""
+
+    def __init__(self, problem: Problem) -> None:
+        n_nodes, n_runs = problem.has_frame.shape
+        self._problem = problem
+        self.R = np.empty((n_nodes, n_runs, 3, 3))
+        self.x = np.empty((n_nodes, n_runs, N_STATES))
+        self.P = np.empty((n_nodes, n_runs, N_STATES, N_STATES))
+        self._R_pred = np.empty_like(self.R)
+        self._x_pred = np.empty_like(self.x)
+        self._P_pred = np.empty_like(self.P)
+        self._F = np.zeros((n_nodes - 1, n_runs, N_STATES, N_STATES))
+        self.nis = np.full((n_nodes, n_runs), np.nan)
+        self._run()
+
+    def _run(self) -> None:
+        pr = self._problem
+        n_nodes = len(pr.has_frame)
+        F_all, Q = self._F, _process_noise(pr)
+        i = np.arange(N_STATES)
+        F_all[..., i, i] = 1.0
+        F_all[..., ATT, ATT] = np.swapaxes(pr.R_step, -1, -2)
+        i = np.arange(3)
+        F_all[..., i, 9 + i] = -pr.dt_s[..., None]
+        F_all[..., 3 + i, 6 + i] = F_all[..., 6 + i, 15 + i] = pr.dt_s[..., None]
+        F_all[..., 3 + i, 15 + i] = 0.5 * pr.dt_s[..., None] ** 2
+        effect = _sensitivities(pr)
+        dt1 = pr.dt_s[..., None]
+        any_frame = pr.has_frame.any(axis=1)
+        R, x, P = pr.start.R.copy(), pr.start.x.copy(), pr.P_start.copy()
+        for k in range(n_nodes):
+            if k:
+                j, dt = k - 1, dt1[k - 1]
+                # Body-axes changes of dv and dp from bias and lag estimates off the linearisation point.
+                off = np.concatenate([x[:, BA] - pr.ba_lin, (x[:, LAG] - pr.lag_lin)[:, None]], axis=1)
+                change = _matvec(effect[j, :, :, 3:], off)
+                world = R @ np.stack(
+                    [pr.dv_mps[j] + change[:, :3], pr.dp_m[j] + change[:, 3:]], axis=2
+                )  # (B, 3, [dv, dp])
+                F = F_all[j]
+                F[:, VEL, ATT] = R @ effect[j, :, :3, :3]
+                F[:, POS, ATT] = R @ effect[j, :, 3:, :3]
+                F[:, VEL, BA] = R @ effect[j, :, :3, 3:6]
+                F[:, POS, BA] = R @ effect[j, :, 3:, 3:6]
+                F[:, VEL, LAG] = _matvec(R, effect[j, :, :3, 6])
+                F[:, POS, LAG] = _matvec(R, effect[j, :, 3:, 6])
+                x[:, POS] += dt * x[:, VEL] + 0.5 * dt * dt * x[:, GRAV] + world[:, :, 1]
+                x[:, VEL] += dt * x[:, GRAV] + world[:, :, 0]
+                R = R @ pr.R_step[j]
+                R = R - R @ skew(dt * (x[:, BG] - pr.bg_lin))
+                R = 1.5 * R - 0.5 * R @ (np.swapaxes(R, -1, -2) @ R)  # one Newton step back to orthonormal
+                P = F @ P @ np.swapaxes(F, -1, -2) + Q[j]
+            self._R_pred[k], self._x_pred[k], self._P_pred[k] = R, x, P
+            if any_frame[k]:
+                R, x, P = self._update(k, R, x, P)
+            self.R[k], self.x[k], self.P[k] = R, x, P
+
+    def _update(
+        self, k: int, R: FloatArray, x: FloatArray, P: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        pr = self._problem
+        runs = np.flatnonzero(pr.has_frame[k])
+        state = State(R[runs], x[runs])
+        since_mid = pr.since_mid_s[k, runs]
+        dt = (state.x[:, TAU] - pr.tau_lin[runs]) + since_mid * (state.x[:, SKEW] - pr.skew_lin[runs])
+        omega = pr.omega_radps[k, runs] - state.x[:, BG]
+        R_hat, p_hat, H = observe(state, omega, pr.lever_arm_m[runs], since_mid, dt)
+        turn = rvec_from_matrix(np.swapaxes(R_hat, -1, -2) @ pr.R_seen[k, runs])
+        y = np.concatenate([turn, pr.p_seen_m[k, runs] - p_hat], axis=1)
+        before = P[runs]
+        PHt = before @ np.swapaxes(H, -1, -2)
+        predicted = H @ PHt
+        S = predicted + pr.cov_seen[k, runs]
+        nis = (y * np.linalg.solve(S, y[..., None])[..., 0]).sum(axis=1)
+        self.nis[k, runs] = nis
+        # A frame beyond what S allows is believed less, in proportion: never refused, so that the filter
+        # finds back after it has gone wrong itself. The second pass judges with hindsight.
+        inflate = np.maximum(nis / CHI2_6_95, 1.0)[:, None, None]
+        S = predicted + inflate * pr.cov_seen[k, runs]
+        gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(PHt, -1, -2)), -1, -2)
+        moved = _move(state, _matvec(gain, y))
+        after = before - gain @ np.swapaxes(PHt, -1, -2)
+        R, x, P = R.copy(), x.copy(), P.copy()
+        R[runs], x[runs] = moved.R, moved.x
+        P[runs] = 0.5 * (after + np.swapaxes(after, -1, -2))
+        return R, x, P
+
+    def forward(self) -> Estimate:
+        """Return the filtered states: each knows only the past."""
+        return Estimate(State(self.R, self.x), self.P, self.nis)
+
+    def smooth(self) -> Estimate:
+        """Return the states given all frames (Rauch, Tung and Striebel)."""
+        # G = P F^T P_pred^-1 for all steps at once, scaled to unit diagonal: the units differ by 1e10.
+        scale = 1 / np.sqrt(np.diagonal(self._P_pred[1:], axis1=-2, axis2=-1))
+        scaled = self._P_pred[1:] * scale[..., :, None] * scale[..., None, :]
+        FP = self._F @ self.P[:-1]
+        gains = np.swapaxes(np.linalg.solve(scaled, FP * scale[..., :, None]) * scale[..., :, None], -1, -2)
+        R, x, P = self.R.copy(), self.x.copy(), self.P.copy()
+        for k in range(len(R) - 2, -1, -1):
+            d = x[k + 1] - self._x_pred[k + 1]
+            d[:, ATT] = _small_rvec(np.swapaxes(self._R_pred[k + 1], -1, -2) @ R[k + 1])
+            moved = _move(State(self.R[k], self.x[k]), _matvec(gains[k], d))
+            R[k], x[k] = moved.R, moved.x
+            Pk = self.P[k] + gains[k] @ (P[k + 1] - self._P_pred[k + 1]) @ np.swapaxes(gains[k], -1, -2)
+            P[k] = 0.5 * (Pk + np.swapaxes(Pk, -1, -2))
+        return Estimate(State(R, x), P, self.nis)

@@ -1,0 +1,198 @@
+"""Judge the fusion on real inertial + motion-capture recordings, beside simpler methods, in one table.
+
+Data: six windows of BROAD (Laidig, Caruso, Aparicio, Seel, Data 6(7):72, 2021, CC BY 4.0). Their README holds
+the recipe followed here: poses thinned to camera rate with noise and dropouts, a hidden time offset and
+skew, an unknown direction of gravity, and inertial signals made BNO055-like (simulated sensor on recorded
+motion). Every random choice comes from the seed, so that other seeds are other data.
+
+Run: ``python scripts/bench_fusion.py $BRICKTRACK_SAMPLES/fusion --seeds 3``
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.signal import butter, lfilter
+from scipy.spatial.transform import Rotation, Slerp
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
+
+LEVER_ARM_MM = (26.045, 53.000, 14.199)
+CAMERA_EPOCH_NS = 1_000_000_000_000  # what the camera's clock says at the recording's t = 0
+GYRO_LAG_S = 4.19e-3
+ACC_LAG_S = 2.53e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What is done to a window; the defaults are the README's."""
+
+    frame_rate_hz: float = 30.0058
+    position_sd_mm: float = 0.1
+    rotation_sd_deg: float = 0.1
+    n_dropouts: int = 4
+    imu_rate_hz: float = 100.0
+    lowpass_hz: float = 40.0
+    lowpass_order: int = 2
+    acc_step_mps2: float = 0.01
+    gyro_step_radps: float = np.deg2rad(1 / 16)
+    acc_range_g: float = 16.0
+    keep_native_lags: bool = False
+    max_offset_s: float = 0.15
+    max_skew: float = 50e-6
+    stamp_jitter_s: float = 40e-6
+    outlier_share: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One window after the recipe: what the fusion gets, and the truth that it does not get."""
+
+    name: str
+    optical: OpticalTrack
+    imu: ImuTrack
+    offset_s: float
+    lag_s: float
+    t_out_ns: IntArray
+    R_true: FloatArray
+    t_true_mm: FloatArray
+    in_dropout: BoolArray
+
+
+def _dropouts(rng: np.random.Generator, n: int, t_end_s: float) -> list[tuple[float, float]]:
+    """Return ``n`` stretches of 0.15-0.5 s, each in its own part of the run."""
+    edges = np.linspace(0.8, t_end_s - 0.8, n + 1)
+    lengths = rng.uniform(0.15, 0.5, n)
+    return [
+        (a, a + d)
+        for a, d in (
+            (rng.uniform(lo, hi - d), d) for lo, hi, d in zip(edges, edges[1:], lengths, strict=False)
+        )
+    ]
+
+
+def make_case(path: Path, *, seed: int, recipe: Recipe | None = None) -> Case:
+    """Return one window treated by the recipe; the same seed gives the same case."""
+    recipe = recipe or Recipe()
+    rng = np.random.default_rng([seed, *path.stem.encode()])
+    with np.load(path) as d:
+        t, p_m, q_xyzw = d["t_mocap"], d["p"], d["q_xyzw"]
+        t_gyro, gyro = d["t_gyro"], d["gyro"].astype(np.float64)
+        t_acc, acc = d["t_acc"], d["acc"].astype(np.float64)
+        sensor_m = d["imu_in_opt_m"]
+    if recipe.keep_native_lags:
+        t_gyro, t_acc = t_gyro + GYRO_LAG_S, t_acc + ACC_LAG_S
+
+    scene = Rotation.random(rng=rng)
+    body = scene * Rotation.from_quat(q_xyzw)
+    lever_m = np.array(LEVER_ARM_MM) / 1000
+    origin_mm = 1000 * (scene.apply(p_m) + body.apply(sensor_m - lever_m))
+    position, attitude = CubicSpline(t, origin_mm), Slerp(t, body)
+
+    # Optics.
+    t_frame = np.arange(rng.uniform(0, 1 / recipe.frame_rate_hz), 15.0, 1 / recipe.frame_rate_hz)
+    noise_rad = rng.normal(0, np.deg2rad(recipe.rotation_sd_deg), (t_frame.size, 3))
+    R = (attitude(t_frame) * Rotation.from_rotvec(noise_rad)).as_matrix()
+    p_mm = position(t_frame) + rng.normal(0, recipe.position_sd_mm, (t_frame.size, 3))
+    outlier = rng.random(t_frame.size) < recipe.outlier_share
+    p_mm[outlier] += rng.normal(0, 8.0, (outlier.sum(), 3))
+    dropouts = _dropouts(rng, recipe.n_dropouts, 15.0)
+    lost = np.zeros(t_frame.size, dtype=bool)
+    for a, b in dropouts:
+        lost |= (t_frame > a) & (t_frame < b)
+    R[lost], p_mm[lost] = np.nan, np.nan
+    sd = np.r_[np.full(3, np.deg2rad(recipe.rotation_sd_deg)), np.full(3, recipe.position_sd_mm)]
+    t_frame_ns = CAMERA_EPOCH_NS + np.round(t_frame * 1e9).astype(np.int64)
+    optical = OpticalTrack(
+        t_ns=t_frame_ns,
+        R_camera_brick=R,
+        t_camera_brick_mm=p_mm,
+        covariance=np.broadcast_to(np.diag(sd**2), (t_frame.size, 6, 6)).copy(),
+        flags=np.where(lost, int(PoseFlag.NO_POSE), 0).astype(np.int64),
+        residual_px=np.full((t_frame.size, 0, 2), np.nan),
+        led_t_ns=np.zeros((t_frame.size, 0), dtype=np.int64),
+    )
+
+    # Inertia: low-pass at the native rate, its constant delay taken out of the stamps, then 100 Hz.
+    offset_s = rng.uniform(-recipe.max_offset_s, recipe.max_offset_s)
+    skew = rng.uniform(-recipe.max_skew, recipe.max_skew)
+    t_mid = 0.5 * (t_frame[0] + t_frame[-1])
+    native_hz = 1 / np.median(np.diff(t))
+    b, a = butter(recipe.lowpass_order, recipe.lowpass_hz, fs=native_hz)
+    n = np.arange(400)
+    response = lfilter(b, a, (n == 0).astype(float))
+    delay_s = float((n * response).sum() / response.sum() / native_hz)
+    gyro_at = make_interp_spline(t_gyro - delay_s, lfilter(b, a, gyro - gyro[0], axis=0) + gyro[0], k=3)
+    acc_at = make_interp_spline(t_acc - delay_s, lfilter(b, a, acc - acc[0], axis=0) + acc[0], k=3)
+    t_sample = np.arange(rng.uniform(-0.3, -0.29), 15.3, 1 / recipe.imu_rate_hz)
+    limit = recipe.acc_range_g * 9.80665
+    acc_s = np.clip(np.round(acc_at(t_sample) / recipe.acc_step_mps2) * recipe.acc_step_mps2, -limit, limit)
+    gyro_s = np.round(gyro_at(t_sample) / recipe.gyro_step_radps) * recipe.gyro_step_radps
+    stamp_s = t_sample + offset_s + skew * (t_sample - t_mid)
+    stamp_s = stamp_s + rng.normal(0, recipe.stamp_jitter_s, t_sample.size)
+    imu = ImuTrack(
+        t_ns=CAMERA_EPOCH_NS + np.round(stamp_s * 1e9).astype(np.int64),
+        acc_mps2=acc_s,
+        gyro_radps=gyro_s,
+        flags=np.zeros(t_sample.size, dtype=np.int64),
+        acc_range_mps2=limit,
+    )
+
+    t_out = t_sample[(t_sample >= t_frame[~lost][0]) & (t_sample <= t_frame[~lost][-1])]
+    inside = np.zeros(t_out.size, dtype=bool)
+    for a_s, b_s in dropouts:
+        inside |= (t_out > a_s) & (t_out < b_s)
+    return Case(
+        name=path.stem.removeprefix("dev_"),
+        optical=optical,
+        imu=imu,
+        offset_s=offset_s + (GYRO_LAG_S if recipe.keep_native_lags else 0.0),
+        lag_s=(ACC_LAG_S - GYRO_LAG_S) if recipe.keep_native_lags else 0.0,
+        t_out_ns=CAMERA_EPOCH_NS + np.round(t_out * 1e9).astype(np.int64),
+        R_true=attitude(t_out).as_matrix(),
+        t_true_mm=position(t_out),
+        in_dropout=inside,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """RMS errors of one method on one case; mm (length of the vector) and deg."""
+
+    outside_mm: float
+    inside_mm: float
+    outside_deg: float
+    inside_deg: float
+
+
+def score(case: Case, R: FloatArray, t_mm: FloatArray) -> Score:
+    """Return the errors at every inertial sample, outside and inside the dropouts."""
+    shift = np.linalg.norm(t_mm - case.t_true_mm, axis=1)
+    turn = np.degrees(np.linalg.norm(rvec_from_matrix(np.swapaxes(case.R_true, 1, 2) @ R), axis=1))
+
+    def rms(values: FloatArray, where: BoolArray) -> float:
+        return float(np.sqrt(np.mean(values[where] ** 2))) if where.any() else float("nan")
+
+    inside = case.in_dropout
+    return Score(rms(shift, ~inside), rms(shift, inside), rms(turn, ~inside), rms(turn, inside))
+
+
+def interpolate_frames(case: Case) -> tuple[FloatArray, FloatArray]:
+    """Return poses between frames: a cubic for the position, constant rate for the rotation."""
+    seen = np.isfinite(case.optical.t_camera_brick_mm).all(axis=1)
+    t_s = (case.optical.t_ns[seen] - CAMERA_EPOCH_NS) * 1e-9
+    at_s = (case.t_out_ns - CAMERA_EPOCH_NS) * 1e-9
+    p = CubicSpline(t_s, case.optical.t_camera_brick_mm[seen])(at_s)
+    R = Slerp(t_s, Rotation.from_matrix(case.optical.R_camera_brick[seen]))(at_s).as_matrix()
+    return R, np.asarray(p)
+
+
+def normalised_errors(case: Case, track: FusedTrack) -> FloatArray:
+    """Return the squared error over its covariance at every instant; 6 on average when honest."""
+    turn = rvec_from_matrix(np.swapaxes(track.R_camera_brick, 1, 2) @ case.R_true)
+    e = np.concatenate([turn, case.t_true_mm - track.t_camera_brick_mm], axis=1)
+    return np.asarray((e * np.linalg.solve(track.covariance, e[..., None])[..., 0]).sum(axis=1))
