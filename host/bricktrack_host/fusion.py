@@ -6,7 +6,7 @@ loop over time.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +19,8 @@ from bricktrack_host.fused_output import sample_motion
 from bricktrack_host.fusion_problem import (
     FusionSettings,
     Linearisation,
+    NoiseLevel,
+    NoiseParts,
     Nodes,
     Run,
     build_problem,
@@ -46,6 +48,8 @@ from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 logger = logging.getLogger(__name__)
 
 _RUNS_AT_ONCE = 8  # 2000 nodes of four 21 x 21 matrices take 28 MB a run
+_LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
+_EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
 _CHI_3_MEDIAN = 1.538  # median of the root of chi-square with 3 degrees of freedom
 
 
@@ -75,6 +79,8 @@ class FusionResult:
         Frames left out as outliers.
     mean_nis : float
         Mean innovation squared over its covariance in the last forward pass; 6 when all is as believed.
+    gyro_noise, acc_noise : NoiseLevel
+        How much the samples were believed.
     rotation_noise_scale, position_noise_scale : float
         What the stated optical sd had to be multiplied by, at least 1.
     """
@@ -97,6 +103,8 @@ class FusionResult:
     frame_chi2: FloatArray
     frame_rejected: BoolArray
     mean_nis: float
+    gyro_noise: NoiseLevel
+    acc_noise: NoiseLevel
     rotation_noise_scale: float
     position_noise_scale: float
 
@@ -221,20 +229,6 @@ def _attitude_at_first_node(run: Run, nodes: Nodes, lin: Linearisation) -> Float
     return nearest_rotation(run.R_seen[0] @ chain_rotations(step.R)[-1].T)
 
 
-def _with_start(lin: Linearisation, R_first: FloatArray) -> Linearisation:
-    return Linearisation(
-        tau_s=lin.tau_s,
-        skew=lin.skew,
-        lag_s=lin.lag_s,
-        bg_radps=lin.bg_radps,
-        ba_mps2=lin.ba_mps2,
-        R_first=R_first,
-        v_first_mps=lin.v_first_mps,
-        p_first_m=lin.p_first_m,
-        gravity_mps2=lin.gravity_mps2,
-    )
-
-
 def _relinearise(estimate: Estimate, b: int, n_nodes: int, settings: FusionSettings) -> Linearisation:
     """Return the linearisation at the first pass's result for run b."""
     x = estimate.state.x[:n_nodes, b]
@@ -276,6 +270,42 @@ def _frame_chi2(
     return chi2(slice(0, 3)), chi2(slice(3, 6)), chi2(slice(0, 6))
 
 
+def _choices(settings: FusionSettings) -> tuple[list[NoiseLevel], FloatArray]:
+    """Return the noise levels that a run may choose from, the stated one first, and what each must earn."""
+    steps = [(i, j) for i in (0, -1, -2) for j in (0, 1, 2)]
+    levels = [NoiseLevel(settings.roughness_share * _LEVEL_STEP**i, _LEVEL_STEP**j) for i, j in steps]
+    return levels, np.array([_EARN_PER_STEP * (abs(i) + abs(j)) for i, j in steps])
+
+
+def _choose_noise(
+    problem: Problem, parts: list[NoiseParts], settings: FusionSettings
+) -> list[tuple[NoiseLevel, NoiseLevel]]:
+    """Return the noise levels of gyro and accelerometer under which each run's frames are likeliest.
+
+    First the gyro's, then the accelerometer's: all choices of all runs as one batch.
+    """
+    levels, price = _choices(settings)
+    n_runs, n = len(parts), len(levels)
+
+    def best(gyro: FloatArray, acc: FloatArray) -> IntArray:
+        likelihood = Filter(problem.with_noise_choices(gyro, acc), keep=False).log_likelihood
+        return np.argmax(likelihood.reshape(n_runs, n) - price, axis=1)
+
+    gyro = np.repeat(problem.gyro_var[..., None], n, axis=2)
+    acc = np.repeat(problem.acc_var[..., None], n, axis=2)
+    trial = gyro.copy()
+    for b, part in enumerate(parts):
+        for i, level in enumerate(levels):
+            trial[: len(part.gyro_fixed), b, i] = part.gyro(level)
+    of_gyro = best(trial, acc)
+    for b, part in enumerate(parts):
+        gyro[: len(part.gyro_fixed), b] = part.gyro(levels[of_gyro[b]])[:, None]
+        for i, level in enumerate(levels):
+            acc[: len(part.acc_fixed), b, i] = part.acc(level)
+    of_acc = best(gyro, acc)
+    return [(levels[g], levels[a]) for g, a in zip(of_gyro, of_acc, strict=True)]
+
+
 def _fuse_together(
     inputs: Sequence[FusionInput], settings: FusionSettings, with_forward: bool
 ) -> list[FusionResult]:
@@ -283,14 +313,25 @@ def _fuse_together(
     lins = [first_linearisation(run, settings) for run in runs]
     used = [np.ones(len(run.t_cam_s), dtype=np.bool_) for run in runs]
     scales = [np.ones(2) for _ in runs]
+    stated = NoiseLevel(settings.roughness_share, 1.0)
+    levels = [(stated, stated) for _ in runs]
+
+    def build() -> tuple[Problem, list[NoiseParts]]:
+        return build_problem(
+            runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
+        )
+
     for second in (False, True):
         nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
         if not second:
             lins = [
-                _with_start(lin, _attitude_at_first_node(run, node, lin))
+                replace(lin, R_first=_attitude_at_first_node(run, node, lin))
                 for run, node, lin in zip(runs, nodes, lins, strict=True)
             ]
-        problem = build_problem(runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales)
+        problem, parts = build()
+        if not second and settings.adapt_noise:
+            levels = _choose_noise(problem, parts, settings)
+            problem, parts = build()
         passed = Filter(problem)
         estimate = passed.smooth()
         chi2s = [_frame_chi2(problem, estimate, b, nodes[b], used[b]) for b in range(len(runs))]
@@ -350,6 +391,8 @@ def _fuse_together(
                 frame_chi2=chi2,
                 frame_rejected=rejected,
                 mean_nis=float(np.nanmean(passed.nis[:, b])),
+                gyro_noise=levels[b][0],
+                acc_noise=levels[b][1],
                 rotation_noise_scale=float(scales[b][0]),
                 position_noise_scale=float(scales[b][1]),
             )

@@ -31,7 +31,11 @@ class FusionSettings:
         How long errors by scale and lever arm keep their sign: about a tenth of a second at 2-10 Hz.
     roughness_share : float
         Error of the integrated signal over the roughness of the samples. A 2 ms impact seen through 40 Hz
-        and 100 Hz loses up to a third of its velocity change by where it falls between samples.
+        and 100 Hz loses up to a third of its velocity change by where it falls between samples. A steady
+        vibration loses far less: see `adapt_noise`.
+    adapt_noise : bool
+        Whether each run chooses its share of roughness and its multiple of the systematic errors by the
+        likelihood of its frames.
     gyro_bias_walk_radps, acc_bias_walk_mps2 : float
         Wander of the biases in one second.
     gyro_bias_sd_radps, acc_bias_sd_mps2 : float
@@ -58,6 +62,7 @@ class FusionSettings:
     lever_arm_sd_mm: float = 1.0
     systematic_time_s: float = 0.1
     roughness_share: float = 0.5
+    adapt_noise: bool = True
     gyro_bias_walk_radps: float = 3e-4
     acc_bias_walk_mps2: float = 0.01
     gyro_bias_sd_radps: float = 0.02
@@ -209,37 +214,76 @@ def place_nodes(run: Run, lin: Linearisation) -> Nodes:
     return Nodes(t_s, np.searchsorted(t_s, t_frame).astype(np.int64))
 
 
-def noise_densities(
-    signal: ImuSignal, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
-) -> tuple[FloatArray, FloatArray]:
-    """Return spectral densities of gyro and accelerometer errors at instants, rad^2/s and m^2/s^3.
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseParts:
+    """Spectral densities of inertial errors at instants, by cause; shape (n,), rad^2/s and m^2/s^3.
 
-    White noise of the samples; motion faster than the samples follow (roughness); scale and lever-arm errors in
-    proportion to the motion, which keep their sign for a while; clipping; and gaps, where the signal is only
-    bridged and its whole spread is the error.
+    Attributes
+    ----------
+    gyro_fixed, acc_fixed
+        White noise of the samples, clipping, and gaps, where the signal is only bridged and its whole spread is
+        the error.
+    gyro_rough, acc_rough
+        Motion faster than the samples follow, at a share of 1.
+    gyro_systematic, acc_systematic
+        Scale and lever-arm errors in proportion to the motion, which keep their sign for a while.
     """
+
+    gyro_fixed: FloatArray
+    gyro_rough: FloatArray
+    gyro_systematic: FloatArray
+    acc_fixed: FloatArray
+    acc_rough: FloatArray
+    acc_systematic: FloatArray
+
+    def gyro(self, level: "NoiseLevel") -> FloatArray:
+        """Return the whole density for one level."""
+        return np.asarray(
+            self.gyro_fixed + level.roughness**2 * self.gyro_rough + level.systematic**2 * self.gyro_systematic
+        )
+
+    def acc(self, level: "NoiseLevel") -> FloatArray:
+        """Return the whole density for one level."""
+        return np.asarray(
+            self.acc_fixed + level.roughness**2 * self.acc_rough + level.systematic**2 * self.acc_systematic
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseLevel:
+    """How much of the roughness, and how many times the stated systematic error, is believed to be error."""
+
+    roughness: float
+    systematic: float
+
+
+def noise_parts(
+    signal: ImuSignal, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
+) -> NoiseParts:
+    """Return how far the inertial signal is to be trusted at instants of IMU time."""
     s, period, hold = settings, signal.period_s, settings.systematic_time_s
     gyro = signal.gyro_radps - lin.bg_radps
-    # Angular acceleration by central differences, and what of the force is not constant in the body.
-    turn = np.gradient(gyro, signal.t_s, axis=0)
+    turn = np.linalg.norm(np.gradient(gyro, signal.t_s, axis=0), axis=1)
     size = np.linalg.norm(gyro, axis=1)
+    # What of the force is not constant in the body: the constant part is the bias state's.
     moving = np.linalg.norm(signal.acc_mps2 - np.median(signal.acc_mps2, axis=0), axis=1)
     arm_m = s.lever_arm_sd_mm * 1e-3
-    gyro_var = (s.gyro_noise_radps**2 + (s.roughness_share * signal.gyro_roughness_radps) ** 2) * period + (
-        s.gyro_scale_sd * size
-    ) ** 2 * hold
-    acc_var = (
-        s.acc_noise_mps2**2 + (s.roughness_share * signal.acc_roughness_mps2) ** 2 + signal.clip_sd_mps2**2
-    ) * period + (
-        (s.acc_scale_sd * moving) ** 2 + (arm_m * (np.linalg.norm(turn, axis=1) + size**2)) ** 2
-    ) * hold
-    q_gyro = np.interp(t_s, signal.t_s, gyro_var)
-    q_acc = np.interp(t_s + lin.lag_s, signal.t_s, acc_var)
-    gap = signal.in_gap(t_s)
-    if gap.any():
-        q_gyro[gap] += (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2 * hold
-        q_acc[gap] += (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2 * hold
-    return q_gyro, q_acc
+
+    def at(values: FloatArray, shift_s: float) -> FloatArray:
+        return np.interp(t_s + shift_s, signal.t_s, values)
+
+    gap = np.where(signal.in_gap(t_s), hold, 0.0)
+    return NoiseParts(
+        gyro_fixed=s.gyro_noise_radps**2 * period + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2,
+        gyro_rough=at(signal.gyro_roughness_radps**2 * period, 0.0),
+        gyro_systematic=at((s.gyro_scale_sd * size) ** 2 * hold, 0.0),
+        acc_fixed=at((s.acc_noise_mps2**2 + signal.clip_sd_mps2**2) * period, lin.lag_s)
+        + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2,
+        acc_rough=at(signal.acc_roughness_mps2**2 * period, lin.lag_s),
+        acc_systematic=at(
+            ((s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2) * hold, lin.lag_s
+        ),
+    )
 
 
 def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> FloatArray:
@@ -268,7 +312,8 @@ def build_problem(
     settings: FusionSettings,
     use_frame: list[BoolArray],
     noise_scale: list[FloatArray],
-) -> Problem:
+    levels: list[tuple[NoiseLevel, NoiseLevel]],
+) -> tuple[Problem, list[NoiseParts]]:
     """Return the batch's arrays, time first; shorter runs are padded with steps of no duration.
 
     Parameters
@@ -276,7 +321,15 @@ def build_problem(
     use_frame : list of ndarray of bool, shape (n_frames,)
     noise_scale : list of ndarray, shape (2,)
         Factors on the stated sd of optical rotation and position.
+    levels : list of (NoiseLevel, NoiseLevel)
+        Of gyro and accelerometer.
+
+    Returns
+    -------
+    problem, parts : Problem, list of NoiseParts
+        The parts at the steps of each run, from which other levels can be made.
     """
+    parts: list[NoiseParts] = []
     n_nodes, n_runs = max(len(n.t_s) for n in nodes), len(runs)
     steps, eye = (n_nodes - 1, n_runs), np.eye(3)
     zeros3 = np.zeros((*steps, 3))
@@ -319,7 +372,8 @@ def build_problem(
         pr.R_step[:k, b], pr.R_half[:k, b] = step.R, step.R_half
         pr.dv_mps[:k, b], pr.dp_m[:k, b], pr.f_rate_mps3[:k, b] = step.dv_mps, step.dp_m, step.f_rate_mps3
         middle = 0.5 * (node.t_s[1:] + node.t_s[:-1])
-        pr.gyro_var[:k, b], pr.acc_var[:k, b] = noise_densities(run.signal, middle, lin, settings)
+        parts.append(noise_parts(run.signal, middle, lin, settings))
+        pr.gyro_var[:k, b], pr.acc_var[:k, b] = parts[b].gyro(levels[b][0]), parts[b].acc(levels[b][1])
         pr.omega_radps[: k + 1, b] = run.signal.gyro_at(node.t_s)
         at = node.node_of_frame
         pr.has_frame[at, b] = use_frame[b]
@@ -332,4 +386,4 @@ def build_problem(
         x[POS], x[VEL], x[BG], x[GRAV] = lin.p_first_m, lin.v_first_mps, lin.bg_radps, lin.gravity_mps2
         x[TAU], x[SKEW] = run.alignment.offset_ns * 1e-9, run.alignment.skew
         x[LAG] = settings.acc_lag_ns * 1e-9
-    return pr
+    return pr, parts

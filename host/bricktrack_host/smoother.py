@@ -6,7 +6,7 @@ skew, accelerometer-minus-gyro lag. Arrays put time first and the runs of the ba
 the one loop over time works on contiguous memory; a run shorter than the others is padded with empty steps.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
 
 N_STATES = 21
+N_MOVING = 9  # attitude, position, velocity: the others stand still or wander
 ATT, POS, VEL, BG, BA, GRAV = (slice(3 * i, 3 * i + 3) for i in range(6))
 TAU, SKEW, LAG = 18, 19, 20
+_STUDENT = 10.0
 CHI2_6_95 = 12.59  # 95 % point of chi-square with 6 degrees of freedom
 
 
@@ -72,6 +74,27 @@ class Problem:
     lag_lin: FloatArray
     start: "State"
     P_start: FloatArray
+
+
+    def with_noise_choices(self, gyro_var: FloatArray, acc_var: FloatArray) -> "Problem":
+        """Return a batch in which each run stands once for each choice of noise, choices running fastest.
+
+        Parameters
+        ----------
+        gyro_var, acc_var : ndarray, shape (K - 1, B, n_choices)
+        """
+        n = gyro_var.shape[2]
+        per_run = {"lever_arm_m", "bg_lin", "ba_lin", "tau_lin", "skew_lin", "lag_lin", "P_start"}
+        changed: dict[str, FloatArray | BoolArray] = {
+            f.name: np.repeat(getattr(self, f.name), n, axis=0 if f.name in per_run else 1)
+            for f in fields(self)
+            if f.name not in ("start", "gyro_var", "acc_var")
+        }
+        flat = (len(gyro_var), -1)
+        start = State(np.repeat(self.start.R, n, axis=0), np.repeat(self.start.x, n, axis=0))
+        return replace(
+            self, **changed, start=start, gyro_var=gyro_var.reshape(flat), acc_var=acc_var.reshape(flat)
+        )  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,17 +194,17 @@ def residuals(problem: Problem, state: State, at: IntArray, b: int) -> tuple[Flo
     return np.concatenate([turn, problem.p_seen_m[at, b] - p], axis=-1), H
 
 
-def _process_noise(problem: Problem) -> FloatArray:
+def _process_noise(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Return the noise of attitude, position and velocity (K-1, B, 9, 9), and of the biases' wander (.., 6)."""
     dt = problem.dt_s
-    Q = np.zeros((*dt.shape, N_STATES, N_STATES))
+    Q = np.zeros((*dt.shape, N_MOVING, N_MOVING))
     i = np.arange(3)
     Q[..., i, i] = (problem.gyro_var * dt)[..., None]
     Q[..., 6 + i, 6 + i] = (problem.acc_var * dt)[..., None]
     Q[..., 3 + i, 6 + i] = Q[..., 6 + i, 3 + i] = (problem.acc_var * dt**2 / 2)[..., None]
     Q[..., 3 + i, 3 + i] = (problem.acc_var * dt**3 / 3)[..., None]
-    Q[..., 9 + i, 9 + i] = (problem.gyro_bias_walk * dt)[..., None]
-    Q[..., 12 + i, 12 + i] = (problem.acc_bias_walk * dt)[..., None]
-    return Q
+    walk = np.stack([problem.gyro_bias_walk * dt, problem.acc_bias_walk * dt], axis=-1)
+    return Q, np.repeat(walk, 3, axis=-1)
 
 
 def _sensitivities(problem: Problem) -> FloatArray:
@@ -202,62 +225,74 @@ def _sensitivities(problem: Problem) -> FloatArray:
 
 
 class Filter:
-    """The forward pass, kept whole so that the smoother can run back over it."""
+    """The forward pass; when kept whole, the smoother can run back over it.
 
-    def __init__(self, problem: Problem) -> None:
+    Attributes
+    ----------
+    nis : ndarray, shape (K, B)
+        Innovation squared over its covariance, NaN where no frame.
+    log_likelihood : ndarray, shape (B,)
+        Of the frames given the past, by a Student t of 10 degrees of freedom that outliers cannot rule.
+    """
+
+    def __init__(self, problem: Problem, *, keep: bool = True) -> None:
         n_nodes, n_runs = problem.has_frame.shape
         self._problem = problem
-        self.R = np.empty((n_nodes, n_runs, 3, 3))
-        self.x = np.empty((n_nodes, n_runs, N_STATES))
-        self.P = np.empty((n_nodes, n_runs, N_STATES, N_STATES))
+        n_kept = n_nodes if keep else 0
+        self.R = np.empty((n_kept, n_runs, 3, 3))
+        self.x = np.empty((n_kept, n_runs, N_STATES))
+        self.P = np.empty((n_kept, n_runs, N_STATES, N_STATES))
         self._R_pred = np.empty_like(self.R)
         self._x_pred = np.empty_like(self.x)
         self._P_pred = np.empty_like(self.P)
-        self._F = np.zeros((n_nodes - 1, n_runs, N_STATES, N_STATES))
+        self._F = np.zeros((max(n_kept - 1, 0), n_runs, N_MOVING, N_STATES))
         self.nis = np.full((n_nodes, n_runs), np.nan)
-        self._run()
+        self.log_likelihood = np.zeros(n_runs)
+        self._run(keep)
 
-    def _run(self) -> None:
+    def _run(self, keep: bool) -> None:
         pr = self._problem
-        n_nodes = len(pr.has_frame)
-        F_all, Q = self._F, _process_noise(pr)
-        i = np.arange(N_STATES)
-        F_all[..., i, i] = 1.0
-        F_all[..., ATT, ATT] = np.swapaxes(pr.R_step, -1, -2)
-        i = np.arange(3)
-        F_all[..., i, 9 + i] = -pr.dt_s[..., None]
-        F_all[..., 3 + i, 6 + i] = F_all[..., 6 + i, 15 + i] = pr.dt_s[..., None]
-        F_all[..., 3 + i, 15 + i] = 0.5 * pr.dt_s[..., None] ** 2
-        effect = _sensitivities(pr)
-        dt1 = pr.dt_s[..., None]
+        n_nodes, n_runs = pr.has_frame.shape
         any_frame = pr.has_frame.any(axis=1)
+        effect, dt1 = _sensitivities(pr), pr.dt_s[..., None]
+        Q, Q_walk = _process_noise(pr)
+        F = np.zeros((n_runs, N_MOVING, N_STATES))  # the other rows are the identity's
+        i3, walks = np.arange(3), np.arange(BG.start, BA.stop)
+        F[:, np.arange(N_MOVING), np.arange(N_MOVING)] = 1.0
         R, x, P = pr.start.R.copy(), pr.start.x.copy(), pr.P_start.copy()
         for k in range(n_nodes):
             if k:
                 j, dt = k - 1, dt1[k - 1]
-                # Body-axes changes of dv and dp from bias and lag estimates off the linearisation point.
+                turned = R[:, None] @ effect[j].reshape(n_runs, 2, 3, 7)  # dv, dp in camera axes
+                F[:, ATT, ATT] = np.swapaxes(pr.R_step[j], -1, -2)
+                F[:, i3, 9 + i3] = -dt
+                F[:, 3 + i3, 6 + i3] = F[:, 6 + i3, 15 + i3] = dt
+                F[:, 3 + i3, 15 + i3] = 0.5 * dt * dt
+                F[:, VEL, ATT], F[:, POS, ATT] = turned[:, 0, :, :3], turned[:, 1, :, :3]
+                F[:, VEL, BA], F[:, POS, BA] = turned[:, 0, :, 3:6], turned[:, 1, :, 3:6]
+                F[:, VEL, LAG], F[:, POS, LAG] = turned[:, 0, :, 6], turned[:, 1, :, 6]
                 off = np.concatenate([x[:, BA] - pr.ba_lin, (x[:, LAG] - pr.lag_lin)[:, None]], axis=1)
-                change = _matvec(effect[j, :, :, 3:], off)
-                world = R @ np.stack(
-                    [pr.dv_mps[j] + change[:, :3], pr.dp_m[j] + change[:, 3:]], axis=2
-                )  # (B, 3, [dv, dp])
-                F = F_all[j]
-                F[:, VEL, ATT] = R @ effect[j, :, :3, :3]
-                F[:, POS, ATT] = R @ effect[j, :, 3:, :3]
-                F[:, VEL, BA] = R @ effect[j, :, :3, 3:6]
-                F[:, POS, BA] = R @ effect[j, :, 3:, 3:6]
-                F[:, VEL, LAG] = _matvec(R, effect[j, :, :3, 6])
-                F[:, POS, LAG] = _matvec(R, effect[j, :, 3:, 6])
-                x[:, POS] += dt * x[:, VEL] + 0.5 * dt * dt * x[:, GRAV] + world[:, :, 1]
-                x[:, VEL] += dt * x[:, GRAV] + world[:, :, 0]
+                step = R @ np.stack([pr.dv_mps[j], pr.dp_m[j]], axis=2)
+                step = np.swapaxes(step, 1, 2) + _matvec(turned[..., 3:], off[:, None])  # (B, [dv, dp], 3)
+                x[:, POS] += dt * x[:, VEL] + 0.5 * dt * dt * x[:, GRAV] + step[:, 1]
+                x[:, VEL] += dt * x[:, GRAV] + step[:, 0]
                 R = R @ pr.R_step[j]
                 R = R - R @ skew(dt * (x[:, BG] - pr.bg_lin))
                 R = 1.5 * R - 0.5 * R @ (np.swapaxes(R, -1, -2) @ R)  # one Newton step back to orthonormal
-                P = F @ P @ np.swapaxes(F, -1, -2) + Q[j]
-            self._R_pred[k], self._x_pred[k], self._P_pred[k] = R, x, P
+                FP = F @ P
+                P = P.copy()
+                P[:, :N_MOVING] = FP
+                P[:, :, :N_MOVING] = np.swapaxes(FP, -1, -2)
+                P[:, :N_MOVING, :N_MOVING] = FP @ np.swapaxes(F, -1, -2) + Q[j]
+                P[:, walks, walks] += Q_walk[j]
+                if keep:
+                    self._F[j] = F
+            if keep:
+                self._R_pred[k], self._x_pred[k], self._P_pred[k] = R, x, P
             if any_frame[k]:
                 R, x, P = self._update(k, R, x, P)
-            self.R[k], self.x[k], self.P[k] = R, x, P
+            if keep:
+                self.R[k], self.x[k], self.P[k] = R, x, P
 
     def _update(
         self, k: int, R: FloatArray, x: FloatArray, P: FloatArray
@@ -277,6 +312,8 @@ class Filter:
         S = predicted + pr.cov_seen[k, runs]
         nis = (y * np.linalg.solve(S, y[..., None])[..., 0]).sum(axis=1)
         self.nis[k, runs] = nis
+        log_det = np.linalg.slogdet(S)[1]
+        self.log_likelihood[runs] -= 0.5 * (log_det + (_STUDENT + 6) * np.log1p(nis / _STUDENT))
         # A frame beyond what S allows is believed less, in proportion: never refused, so that the filter
         # finds back after it has gone wrong itself. The second pass judges with hindsight.
         inflate = np.maximum(nis / CHI2_6_95, 1.0)[:, None, None]
@@ -298,7 +335,8 @@ class Filter:
         # G = P F^T P_pred^-1 for all steps at once, scaled to unit diagonal: the units differ by 1e10.
         scale = 1 / np.sqrt(np.diagonal(self._P_pred[1:], axis1=-2, axis2=-1))
         scaled = self._P_pred[1:] * scale[..., :, None] * scale[..., None, :]
-        FP = self._F @ self.P[:-1]
+        FP = self.P[:-1].copy()
+        FP[..., :N_MOVING, :] = self._F @ self.P[:-1]
         gains = np.swapaxes(np.linalg.solve(scaled, FP * scale[..., :, None]) * scale[..., :, None], -1, -2)
         R, x, P = self.R.copy(), self.x.copy(), self.P.copy()
         for k in range(len(R) - 2, -1, -1):
