@@ -1,0 +1,258 @@
+"""Poses that fit the pixels best: Gauss-Newton from a start, robust, batched over frames, with covariance.
+
+The residual of an LED is its centroid less the predicted one (`led_profile`), weighted by the centroid's
+covariance, and taken at the LED's own instant: the caller gives how far the brick has moved between the
+frame's instant and the LED's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.errors import TrackingError
+from bricktrack_common.rotations import matrix_from_rvec
+from bricktrack_host.led_profile import predict_brick
+
+HUBER_SIGMAS = 2.5
+"""Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
+OUTLIER_SIGMAS = 5.0
+MIN_LEDS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LedMotion:
+    """How the brick at each LED's instant differs from the brick at the frame's.
+
+    Attributes
+    ----------
+    rvec_brick_rad : ndarray, shape (n, n_leds, 3), rad
+        ``R_led = R @ Exp(rvec)``.
+    shift_camera_mm : ndarray, shape (n, n_leds, 3), mm
+        ``t_led = t + shift``.
+    """
+
+    rvec_brick_rad: FloatArray
+    shift_camera_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedPoses:
+    """Fitted poses, one a frame.
+
+    Attributes
+    ----------
+    R_camera_brick : ndarray, shape (n, 3, 3)
+        NaN where there is none: fewer than four LEDs, no start, or no convergence.
+    t_camera_brick_mm : ndarray, shape (n, 3), mm
+    covariance : ndarray, shape (n, 6, 6)
+        Of ``[dtheta rad, dt mm]``, `bricktrack_host.tracks`.
+    residual_px : ndarray, shape (n, n_leds, 2), px
+        Seen less predicted, for every seen LED, also those weighted down.
+    sigmas : ndarray, shape (n, n_leds)
+        Length of the whitened residual; NaN where not seen.
+    is_outlier : ndarray of bool, shape (n, n_leds)
+        Beyond `OUTLIER_SIGMAS`.
+    chi2 : ndarray, shape (n,)
+        Robust (Huber) cost, twice: about ``2 n_used - 6`` where the model holds.
+    n_used : ndarray of int, shape (n,)
+    area_px2, facing : ndarray, shape (n, n_leds)
+        Predicted, see `led_profile.LedPrediction`.
+    """
+
+    R_camera_brick: FloatArray
+    t_camera_brick_mm: FloatArray
+    covariance: FloatArray
+    residual_px: FloatArray
+    sigmas: FloatArray
+    is_outlier: BoolArray
+    chi2: FloatArray
+    n_used: FloatArray
+    area_px2: FloatArray
+    facing: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evaluation:
+    cost: FloatArray
+    A: FloatArray
+    g: FloatArray
+    residual: FloatArray
+    sigmas: FloatArray
+    area: FloatArray
+    facing: FloatArray
+
+
+def refine_poses(
+    uv_px: FloatArray,
+    cov_px2: FloatArray,
+    R_start: FloatArray,
+    t_start_mm: FloatArray,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    collar_mm: float | None,
+    motion: LedMotion | None = None,
+    max_steps: int = 12,
+) -> RefinedPoses:
+    """Fit poses to centroids.
+
+    Parameters
+    ----------
+    uv_px : ndarray, shape (n, n_leds, 2), px
+        Centroids; NaN where an LED is not seen or not to be used.
+    cov_px2 : ndarray, shape (n, n_leds, 2, 2), px^2
+    R_start, t_start_mm : ndarray, shapes (n, 3, 3) and (n, 3)
+        Starts, from `prsoi` or a track; frames with NaN get no pose.
+    ray_model : RayModel
+    brick_model : BrickModel
+    collar_mm : float or None
+        The LEDs' fitted profile; `None` widens the covariance.
+    motion : LedMotion, optional
+        Rolling shutter; default none.
+    max_steps : int
+        Frames stop when their step is below a nanometre or so; two to four do from a PRSOI start.
+
+    Notes
+    -----
+    Levenberg-Marquardt damping frame by frame, so that no step raises the Huber cost. The covariance is the
+    inverse of the normal matrix with the robust weights, undamped.
+    """
+    n, n_leds = uv_px.shape[:2]
+    if uv_px.shape != (n, brick_model.n_leds, 2) or cov_px2.shape != (n, n_leds, 2, 2):
+        raise TrackingError(
+            f"centroids have shape {uv_px.shape} and covariances {cov_px2.shape} for {brick_model.n_leds} LEDs; "
+            "expected (n, n_leds, 2) and (n, n_leds, 2, 2)"
+        )
+    out = _nothing(n, n_leds)
+    seen = np.isfinite(uv_px).all(axis=-1) & np.isfinite(cov_px2).all(axis=(-2, -1))
+    started = np.isfinite(R_start).all(axis=(1, 2)) & np.isfinite(t_start_mm).all(axis=1)
+    frames = np.flatnonzero((seen.sum(axis=1) >= MIN_LEDS) & started)
+    if frames.size == 0:
+        return out
+    R, t = R_start[frames].copy(), t_start_mm[frames].copy()
+    exp_led = None if motion is None else matrix_from_rvec(motion.rvec_brick_rad)
+    shift = None if motion is None else motion.shift_camera_mm
+
+    def evaluate(which: FloatArray, R: FloatArray, t: FloatArray) -> _Evaluation:
+        R_led, t_led = R, t
+        if exp_led is not None and shift is not None:
+            R_led, t_led = R[:, None] @ exp_led[which], t[:, None] + shift[which]
+        return _evaluate(
+            uv_px[which],
+            cov_px2[which],
+            seen[which],
+            R,
+            R_led,
+            t_led,
+            ray_model,
+            brick_model,
+            collar_mm,
+            exp_led,
+            which,
+        )
+
+    state = evaluate(frames, R, t)
+    damping = np.full(frames.size, 1e-6)
+    live = np.isfinite(state.cost)
+    for _ in range(max_steps):
+        todo = np.flatnonzero(live)
+        if todo.size == 0:
+            break
+        A = state.A[todo]
+        diagonal = np.einsum("nii->ni", A)
+        step = np.linalg.solve(
+            A + (damping[todo, None] * diagonal + 1e-12)[..., None] * np.eye(6), state.g[todo][..., None]
+        )[..., 0]
+        size = np.linalg.norm(step[:, :3], axis=1)
+        step *= np.minimum(1.0, 0.5 / np.maximum(size, 1e-12))[:, None]
+        R_new = R[todo] @ matrix_from_rvec(step[:, :3])
+        t_new = t[todo] + step[:, 3:]
+        new = evaluate(frames[todo], R_new, t_new)
+        better = new.cost <= state.cost[todo] * (1 + 1e-12) + 1e-12
+        took, kept = todo[better], todo[~better]
+        R[took], t[took] = R_new[better], t_new[better]
+        for name in ("cost", "A", "g", "residual", "sigmas", "area", "facing"):
+            getattr(state, name)[took] = getattr(new, name)[better]
+        damping[took] = np.maximum(damping[took] / 10, 1e-9)
+        damping[kept] = np.maximum(damping[kept] * 100, 1e-4)
+        small = (np.abs(step[:, :3]).max(axis=1) < 1e-8) & (np.abs(step[:, 3:]).max(axis=1) < 1e-6)
+        live[todo[small & better]] = False
+        live[damping > 1e6] = False
+    good = np.isfinite(state.cost)
+    condition = np.linalg.cond(state.A[good]) if good.any() else np.zeros(0)
+    good[np.flatnonzero(good)[condition > 1e14]] = False
+    rows = frames[good]
+    out.R_camera_brick[rows], out.t_camera_brick_mm[rows] = R[good], t[good]
+    out.covariance[rows] = np.linalg.inv(state.A[good])
+    out.residual_px[rows], out.sigmas[rows] = state.residual[good], state.sigmas[good]
+    out.is_outlier[rows] = np.nan_to_num(state.sigmas[good]) > OUTLIER_SIGMAS
+    out.chi2[rows] = state.cost[good]
+    out.n_used[rows] = (seen[rows] & ~out.is_outlier[rows]).sum(axis=1)
+    out.area_px2[rows], out.facing[rows] = state.area[good], state.facing[good]
+    return out
+
+
+def _evaluate(
+    uv: FloatArray,
+    cov: FloatArray,
+    seen: BoolArray,
+    R: FloatArray,
+    R_led: FloatArray,
+    t_led: FloatArray,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    collar_mm: float | None,
+    exp_led: FloatArray | None,
+    which: FloatArray,
+) -> _Evaluation:
+    prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_mm)
+    if exp_led is not None:
+        # R_led = R E: a turn dtheta of the frame's brick is E^T dtheta of the LED's.
+        J = J.copy()
+        J[..., :3] = J[..., :3] @ np.swapaxes(exp_led[which], -1, -2)
+    residual = np.where(seen[..., None], uv - prediction.uv_px, 0.0)
+    C = np.where(seen[..., None, None], cov + prediction.model_cov_px2, np.eye(2))
+    det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] ** 2
+    W = np.empty_like(C)
+    W[..., 0, 0], W[..., 1, 1] = C[..., 1, 1] / det, C[..., 0, 0] / det
+    W[..., 0, 1] = W[..., 1, 0] = -C[..., 0, 1] / det
+    Wr = np.einsum("nlij,nlj->nli", W, residual)
+    sigmas = np.sqrt(np.maximum(np.einsum("nli,nli->nl", residual, Wr), 0.0))
+    weight = np.where(seen, np.minimum(1.0, HUBER_SIGMAS / np.maximum(sigmas, 1e-12)), 0.0)
+    huber = np.where(sigmas <= HUBER_SIGMAS, sigmas**2, HUBER_SIGMAS * (2 * sigmas - HUBER_SIGMAS))
+    J = np.where(seen[..., None, None], J, 0.0)
+    WJ = (weight[..., None, None] * W) @ J
+    n, n_leds = seen.shape
+    A = np.swapaxes(J.reshape(n, 2 * n_leds, 6), 1, 2) @ WJ.reshape(n, 2 * n_leds, 6)
+    g = np.einsum("nlik,nli->nk", WJ, residual)
+    behind = (t_led[..., 2] <= 0).any(axis=-1) if t_led.ndim == 3 else t_led[..., 2] <= 0
+    cost = np.where(seen, huber, 0.0).sum(axis=1)
+    cost = np.where(behind | ~np.isfinite(A).all(axis=(1, 2)), np.inf, cost)
+    return _Evaluation(
+        cost=cost,
+        A=A,
+        g=g,
+        residual=np.where(seen[..., None], residual, np.nan),
+        sigmas=np.where(seen, sigmas, np.nan),
+        area=prediction.area_px2,
+        facing=prediction.facing,
+    )
+
+
+def _nothing(n: int, n_leds: int) -> RefinedPoses:
+    nan = np.nan
+    return RefinedPoses(
+        R_camera_brick=np.full((n, 3, 3), nan),
+        t_camera_brick_mm=np.full((n, 3), nan),
+        covariance=np.full((n, 6, 6), nan),
+        residual_px=np.full((n, n_leds, 2), nan),
+        sigmas=np.full((n, n_leds), nan),
+        is_outlier=np.zeros((n, n_leds), dtype=bool),
+        chi2=np.full(n, nan),
+        n_used=np.zeros(n),
+        area_px2=np.full((n, n_leds), nan),
+        facing=np.full((n, n_leds), nan),
+    )
