@@ -28,7 +28,10 @@ logger = logging.getLogger(__name__)
 ColorRange = Literal["limited", "full", "unknown"]
 _COLOR_RANGES: dict[int, ColorRange] = {1: "limited", 2: "full"}  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
 _PIXEL_FORMATS = ("yuv420p", "yuvj420p")
-REENCODE = "Encode it again with 'ffmpeg -i IN -fps_mode passthrough -c:v libx264 -crf 12 -bf 0 -pix_fmt yuv420p OUT.mp4'"
+REENCODE = (
+    "Encode it again with 'ffmpeg -i IN -fps_mode passthrough -c:v libx264 -crf 12 -bf 0 "
+    "-pix_fmt yuv420p OUT.mp4'"
+)
 _MAX_DECODER_ERRORS_AT_END = 64  # more than any frame-threaded decoder holds back
 
 

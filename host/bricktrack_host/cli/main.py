@@ -1,0 +1,53 @@
+"""The command ``bricktrack``: its options and the commands it is made of."""
+
+import importlib.metadata
+from typing import Annotated
+
+import typer
+
+from bricktrack_host.cli import fleet, import_cmd
+from bricktrack_host.cli._console import out, set_up_logging
+from bricktrack_host.cli._errors import BricktrackGroup
+from bricktrack_host.cli.pull import make_pull_command
+
+app = typer.Typer(
+    name="bricktrack",
+    cls=BricktrackGroup,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"bricktrack {importlib.metadata.version('bricktrack')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    verbose: Annotated[
+        int,
+        typer.Option("--verbose", "-v", count=True, help="Say more; twice: everything.", show_default=False),
+    ] = 0,
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Six-degree-of-freedom motion of cracked bricks on a shaking table, from a camera and an IMU in each."""
+    set_up_logging(verbose)
+
+
+app.command("status")(fleet.status)
+app.command("arm")(fleet.arm)
+app.command("disarm")(fleet.disarm)
+app.command("pull")(make_pull_command())
+app.command("import")(import_cmd.import_recording)
+
+
+def main() -> None:
+    """Run the command line; see `bricktrack_host.cli._errors` for how it ends."""
+    app(prog_name="bricktrack")

@@ -1,0 +1,274 @@
+"""The folder of a run under way, ``<run-id>.part/``: files with holes, and a journal of what is verified.
+
+The journal is JSON lines: first what is being fetched, then one line for every verified range with its
+checksum, written only after the range's bytes are on the disk. A journal cut in the middle of a line, as a
+kill or a power cut leaves it, loses that line.
+"""
+
+import fcntl
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Self
+
+import msgspec
+
+from bricktrack_common.checksums import crc32, sha256_file
+from bricktrack_common.errors import StorageError
+from bricktrack_common.wire_messages import RunDescription
+from bricktrack_host.durable_files import rename_durably, sync_folder, write_durably
+
+JOURNAL_NAME = ".journal.jsonl"  # begins with a dot, which no file of a run may
+JOURNAL_VERSION = 1
+_FLUSH_BYTES = 4 * 1024 * 1024
+
+
+class _Head(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The journal's first line."""
+
+    journal: int
+    description: RunDescription
+
+
+class _Range(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One verified range."""
+
+    file: str
+    offset: int
+    n_bytes: int
+    crc32: int
+
+
+@dataclass(slots=True)
+class _OpenFile:
+    handle: BinaryIO
+    n_bytes: int
+    verified: list[_Range] = field(default_factory=list)
+
+
+class PartFolder:
+    """A run under way on disk; use as a context, which holds a lock on the folder."""
+
+    def __init__(self, path: Path, description: RunDescription, lock: int) -> None:
+        self.path = path
+        self._description = description
+        self._lock = lock
+        self._journal: BinaryIO | None = None
+        self._files: dict[str, _OpenFile] = {}
+        self._unflushed: list[_Range] = []
+
+    @classmethod
+    def open(cls, path: Path, description: RunDescription, *, note: Callable[[str], None]) -> Self:
+        """Open or make the folder, and check what an earlier pull left in it.
+
+        A folder that was begun for other contents of the same run is set aside as ``*.bad-N``.
+
+        Raises
+        ------
+        StorageError
+            If another pull holds the folder.
+        """
+        lock = _make_locked(path)
+        if not _is_journal_of(path / JOURNAL_NAME, description):
+            kept = _free_name(path)
+            rename_durably(path, kept)
+            os.close(lock)
+            note(f"{path.name} was begun for other contents of this run; kept as {kept.name}")
+            lock = _make_locked(path)
+        part = cls(path, description, lock)
+        try:
+            part._resume(note)
+        except BaseException:
+            part.close()
+            raise
+        return part
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            with suppress(OSError):  # the first error is the one to tell
+                self.flush()
+        self.close()
+
+    def close(self) -> None:
+        """Close all files; what was not flushed is fetched again next time."""
+        for file in self._files.values():
+            with suppress(OSError):
+                file.handle.close()
+        if self._journal is not None:
+            with suppress(OSError):
+                self._journal.close()
+        os.close(self._lock)
+
+    @property
+    def n_bytes_verified(self) -> int:
+        """Bytes of the run that are here and verified."""
+        return sum(r.n_bytes for f in self._files.values() for r in f.verified)
+
+    @property
+    def n_bytes_missing(self) -> int:
+        """Bytes of the run that are still to come."""
+        return sum(f.n_bytes for f in self._description.files) - self.n_bytes_verified
+
+    def missing_chunks(self, name: str, chunk_bytes: int) -> list[tuple[int, int]]:
+        """Return offset and length of the chunks of a file that are not verified, in order."""
+        file = self._files[name]
+        chunks: list[tuple[int, int]] = []
+        position = 0
+        ends = sorted((r.offset, r.offset + r.n_bytes) for r in file.verified)
+        for start, end in [*ends, (file.n_bytes, file.n_bytes)]:
+            while position < start:
+                length = min(chunk_bytes, start - position)
+                chunks.append((position, length))
+                position += length
+            position = max(position, end)
+        return chunks
+
+    def write(self, name: str, offset: int, data: bytes) -> None:
+        """Write a verified chunk; every 4 MiB all is made durable and noted in the journal."""
+        file = self._files[name]
+        write_at(file.handle, offset, data)
+        done = _Range(file=name, offset=offset, n_bytes=len(data), crc32=crc32(data))
+        file.verified.append(done)
+        self._unflushed.append(done)
+        if sum(r.n_bytes for r in self._unflushed) >= _FLUSH_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Make all written bytes durable, then the journal that vouches for them."""
+        if not self._unflushed:
+            return
+        for name in {r.file for r in self._unflushed}:
+            os.fsync(self._files[name].handle.fileno())
+        if self._journal is not None:
+            self._journal.write(b"".join(msgspec.json.encode(r) + b"\n" for r in self._unflushed))
+            os.fsync(self._journal.fileno())
+        self._unflushed.clear()
+
+    def sha256(self, name: str) -> str:
+        """Return the hash of a file as it is on disk."""
+        return sha256_file(self.path / name)
+
+    def set_aside(self, name: str) -> Path:
+        """Keep a wrong file beside the folder, as ``<run-id>.bad-N.<name>``, and begin it anew."""
+        old = self._files.pop(name)
+        old.handle.close()
+        self._unflushed = [r for r in self._unflushed if r.file != name]
+        evidence = _free_name(self.path.with_suffix(""), ending=f".{name}")
+        (self.path / name).rename(evidence)
+        sync_folder(self.path.parent)
+        self._files[name] = self._open_file(name, old.n_bytes)
+        self._rewrite_journal()
+        return evidence
+
+    def finish(self) -> None:
+        """Make everything durable, the names too; the folder may then be renamed."""
+        self.flush()
+        sync_folder(self.path)
+
+    @staticmethod
+    def forget_journal(folder: Path) -> None:
+        """Remove the journal from a whole run's folder."""
+        (folder / JOURNAL_NAME).unlink(missing_ok=True)
+
+    def _resume(self, note: Callable[[str], None]) -> None:
+        for file in self._description.files:
+            self._files[file.name] = self._open_file(file.name, file.n_bytes)
+        n_wrong = 0
+        for line in _read_journal(self.path / JOURNAL_NAME)[1:]:
+            known = _parse_range(line)
+            if known is None or known.file not in self._files or not self._still_there(known):
+                n_wrong += 1
+                continue
+            self._files[known.file].verified.append(known)
+        if n_wrong:
+            note(f"{self.path.name}: {n_wrong} ranges noted earlier are not as noted; they are fetched again")
+        self._rewrite_journal()
+
+    def _still_there(self, known: _Range) -> bool:
+        file = self._files[known.file]
+        if known.offset < 0 or known.n_bytes < 1 or known.offset + known.n_bytes > file.n_bytes:
+            return False
+        data = os.pread(file.handle.fileno(), known.n_bytes, known.offset)
+        return len(data) == known.n_bytes and crc32(data) == known.crc32
+
+    def _open_file(self, name: str, n_bytes: int) -> _OpenFile:
+        handle = os.fdopen(os.open(self.path / name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644), "r+b", 0)
+        if os.fstat(handle.fileno()).st_size > n_bytes:
+            handle.truncate(n_bytes)
+        return _OpenFile(handle, n_bytes)
+
+    def _rewrite_journal(self) -> None:
+        """Begin the journal anew with what is durable; the old one stays until it is whole."""
+        if self._journal is not None:
+            self._journal.close()
+        unflushed = {id(r) for r in self._unflushed}
+        ranges = [r for f in self._files.values() for r in f.verified if id(r) not in unflushed]
+        fresh = self.path / f"{JOURNAL_NAME}.new"
+        fresh.unlink(missing_ok=True)
+        head = _Head(journal=JOURNAL_VERSION, description=self._description)
+        write_durably(fresh, b"".join(msgspec.json.encode(line) + b"\n" for line in (head, *ranges)))
+        rename_durably(fresh, self.path / JOURNAL_NAME)
+        self._journal = (self.path / JOURNAL_NAME).open("ab", buffering=0)
+
+
+def _make_locked(path: Path) -> int:
+    """Make the folder if there is none, and return the handle that holds its lock."""
+    path.mkdir(exist_ok=True)
+    sync_folder(path.parent)
+    lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as e:
+        os.close(lock)
+        raise StorageError(f"{path}: another pull is at work here. Wait for it, or stop it") from e
+    return lock
+
+
+def write_at(handle: BinaryIO, offset: int, data: bytes) -> None:
+    """Write all of ``data`` at ``offset``."""
+    view = memoryview(data)
+    while view:
+        n = os.pwrite(handle.fileno(), view, offset)
+        view, offset = view[n:], offset + n
+
+
+def _free_name(path: Path, ending: str = "") -> Path:
+    n = 1
+    while (candidate := path.with_name(f"{path.name}.bad-{n}{ending}")).exists():
+        n += 1
+    return candidate
+
+
+def _read_journal(path: Path) -> list[bytes]:
+    """Return the journal's whole lines."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    return data.split(b"\n")[:-1]
+
+
+def _is_journal_of(path: Path, description: RunDescription) -> bool:
+    lines = _read_journal(path)
+    if not lines:
+        return True
+    try:
+        head = msgspec.json.decode(lines[0], type=_Head)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return False
+    return head.journal == JOURNAL_VERSION and head.description == description
+
+
+def _parse_range(line: bytes) -> _Range | None:
+    try:
+        return msgspec.json.decode(line, type=_Range)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return None

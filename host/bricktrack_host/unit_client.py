@@ -1,0 +1,295 @@
+"""Speaks to one brick unit: one request after another, and file chunks with several asked for ahead.
+
+Every request has its own number, and only the reply with that number is believed: replies that come late,
+twice, or from something that speaks no bricktrack are counted and left alone.
+"""
+
+import itertools
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self, TypeVar
+
+import zmq
+
+from bricktrack_common.checksums import crc32
+from bricktrack_common.errors import ProtocolError, TransferError, UnitError, UnitTimeoutError
+from bricktrack_common.wire_messages import (
+    MAX_CHUNK_BYTES,
+    Arm,
+    Armed,
+    Chunk,
+    Confirm,
+    Confirmed,
+    DescribeRun,
+    Disarm,
+    Disarmed,
+    GetStatus,
+    Hello,
+    HelloReply,
+    ListRuns,
+    Read,
+    Refusal,
+    Reply,
+    Request,
+    RunDescription,
+    RunList,
+    StatusReply,
+    VersionError,
+    decode_reply,
+    encode_message,
+)
+
+logger = logging.getLogger(__name__)
+
+CHUNK_BYTES = 256 * 1024
+CREDIT = 10
+_MAX_TRIES_PER_CHUNK = 4
+_POLL_MS = 200  # how soon a stop is noticed
+
+_Reply_T = TypeVar("_Reply_T")
+
+
+class Stopped(Exception):  # noqa: N818  (not an error: somebody asked for it)
+    """The user asked to stop while a unit was being waited for."""
+
+
+@dataclass(slots=True)
+class ClientCounts:
+    """What came that was not waited for, and what had to be asked for again."""
+
+    stray_replies: int = 0
+    """Late, duplicated, or never asked for."""
+    foreign_messages: int = 0
+    """Not of this protocol."""
+    repeated_chunks: int = 0
+    """Asked for again, because they came broken or not at all."""
+
+
+@dataclass(slots=True)
+class _Asked:
+    offset: int
+    length: int
+    tries: int = 0
+
+
+class UnitClient:
+    """A connection to one unit. Not to be shared between threads; the context may be.
+
+    Parameters
+    ----------
+    address : str
+        ``tcp://host:port``.
+    timeout_s : float, s
+        How long a unit may be silent before `UnitTimeoutError` is raised.
+    context : zmq.Context, optional
+        Default: the process's own.
+    stop : threading.Event, optional
+        Once it is set, waiting ends with `Stopped`.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        timeout_s: float = 5.0,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+        stop: threading.Event | None = None,
+    ) -> None:
+        self.address = address
+        self.timeout_s = timeout_s
+        self.counts = ClientCounts()
+        self._stop = stop
+        self._request_ids = itertools.count(1)
+        self._socket = (context or zmq.Context.instance()).socket(zmq.DEALER)
+        for option, value in (
+            (zmq.IMMEDIATE, 1),
+            (zmq.LINGER, 500),
+            (zmq.HEARTBEAT_IVL, 2000),
+            (zmq.HEARTBEAT_TIMEOUT, 6000),
+            (zmq.HANDSHAKE_IVL, 5000),
+            (zmq.RECONNECT_IVL, 100),
+            (zmq.RECONNECT_IVL_MAX, 2000),
+            (zmq.MAXMSGSIZE, MAX_CHUNK_BYTES + 64 * 1024),
+        ):
+            self._socket.setsockopt(option, value)
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as e:
+            self.close()
+            raise UnitError(
+                f"{address}: not an address to connect to ({e}). Give it as tcp://host:port",
+                code="bad-address",
+            ) from e
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection; requests under way are forgotten."""
+        self._socket.close()
+
+    def hello(self, software: str = "bricktrack") -> HelloReply:
+        """Ask who is there."""
+        return self._ask(Hello(software=software), HelloReply)
+
+    def status(self) -> StatusReply:
+        """Ask how the unit is."""
+        return self._ask(GetStatus(), StatusReply)
+
+    def arm(self, label: str = "", *, duration_s: float | None = None, timeout_s: float = 60.0) -> Armed:
+        """Make the unit ready for the next first edge; returns once it *is* ready."""
+        return self._ask(Arm(label=label, duration_s=duration_s), Armed, timeout_s=timeout_s)
+
+    def disarm(self, *, timeout_s: float = 30.0) -> Disarmed:
+        """Bring the unit back to idle without a run."""
+        return self._ask(Disarm(), Disarmed, timeout_s=timeout_s)
+
+    def list_runs(self) -> RunList:
+        """Return the runs on the unit, oldest first."""
+        return self._ask(ListRuns(), RunList)
+
+    def describe_run(self, run_id: str, *, timeout_s: float = 30.0) -> RunDescription:
+        """Return one run's files; the unit may have to hash them first."""
+        reply = self._ask(DescribeRun(run_id=run_id), RunDescription, timeout_s=timeout_s)
+        if reply.run_id != run_id:
+            raise ProtocolError(f"{self.address}: described run {reply.run_id}; asked for {run_id}")
+        return reply
+
+    def confirm(self, run_id: str, sha256: list[str]) -> Confirmed:
+        """Tell the unit that these files, in the order of its description, are verified and on disk here."""
+        return self._ask(Confirm(run_id=run_id, sha256=sha256), Confirmed)
+
+    def read_chunks(
+        self, run_id: str, file_index: int, ranges: list[tuple[int, int]], *, credit: int = CREDIT
+    ) -> Iterator[tuple[int, bytes]]:
+        """Yield the bytes of some ranges of a file as ``(offset, bytes)``, in the order they arrive.
+
+        Up to ``credit`` chunks are asked for ahead. A chunk that does not match its checksum, and one that
+        stays out while others come, is asked for again.
+
+        Parameters
+        ----------
+        ranges : list of (int, int), bytes
+            Offset and length of each chunk, at most `MAX_CHUNK_BYTES` long.
+
+        Raises
+        ------
+        UnitTimeoutError
+            If nothing comes for ``timeout_s``.
+        TransferError
+            If a chunk comes broken four times.
+        UnitError
+            If the unit refuses.
+        """
+        waiting = deque(_Asked(offset, length) for offset, length in ranges)
+        asked: dict[int, _Asked] = {}
+        heard_s = time.monotonic()
+        while waiting or asked:
+            while waiting and len(asked) < credit:
+                chunk = waiting.popleft()
+                chunk.tries += 1
+                read = Read(run_id=run_id, file_index=file_index, offset=chunk.offset, length=chunk.length)
+                asked[self._send(read, heard_s + self.timeout_s)] = chunk
+            what = f"{len(asked)} chunks of file {file_index} of {run_id}"
+            request_id, reply, data = self._receive(heard_s + self.timeout_s, what)
+            if request_id not in asked:
+                self.counts.stray_replies += 1
+                continue
+            chunk = asked.pop(request_id)
+            heard_s = time.monotonic()
+            header = self._expect(reply, Chunk, f"bytes from {chunk.offset} of file {file_index} of {run_id}")
+            problem = _chunk_problem(header, data, run_id, file_index, chunk)
+            if problem:
+                self._ask_again(chunk, waiting, problem)
+            else:
+                yield chunk.offset, data
+                heard_s = time.monotonic()  # a slow disk on this side is not the unit's silence
+            for overdue in [i for i in asked if i < request_id - 2 * credit]:
+                lost = asked.pop(overdue)
+                self._ask_again(lost, waiting, f"the chunk at byte {lost.offset} did not come")
+
+    def _ask_again(self, chunk: _Asked, waiting: deque[_Asked], problem: str) -> None:
+        if chunk.tries >= _MAX_TRIES_PER_CHUNK:
+            raise TransferError(
+                f"{self.address}: {problem}, {chunk.tries} times. Check the network and the unit's card"
+            )
+        logger.warning("%s: %s; asked for again", self.address, problem)
+        self.counts.repeated_chunks += 1
+        waiting.appendleft(chunk)
+
+    def _ask(self, request: Request, kind: type[_Reply_T], *, timeout_s: float | None = None) -> _Reply_T:
+        deadline_s = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
+        asked_for = str(type(request).__struct_config__.tag)
+        request_id = self._send(request, min(deadline_s, time.monotonic() + self.timeout_s))
+        while True:
+            reply_id, reply, _ = self._receive(deadline_s, asked_for)
+            if reply_id == request_id:
+                return self._expect(reply, kind, asked_for)
+            self.counts.stray_replies += 1
+
+    def _expect(self, reply: Reply, kind: type[_Reply_T], asked_for: str) -> _Reply_T:
+        if isinstance(reply, Refusal):
+            raise UnitError(f"{self.address} refused {asked_for}: {reply.message}", code=reply.code)
+        if not isinstance(reply, kind):
+            raise ProtocolError(f"{self.address}: answered {asked_for} with a {type(reply).__name__}")
+        return reply
+
+    def _send(self, request: Request, deadline_s: float) -> int:
+        self._wait_for(zmq.POLLOUT, deadline_s, "no connection")
+        request_id = next(self._request_ids)
+        self._socket.send(encode_message(request_id, request), zmq.NOBLOCK)
+        return request_id
+
+    def _receive(self, deadline_s: float, waiting_for: str) -> tuple[int, Reply, bytes]:
+        """Return the next message of this protocol: its number, its body and the bytes behind it."""
+        while True:
+            self._wait_for(zmq.POLLIN, deadline_s, f"no answer to {waiting_for}")
+            header, *rest = self._socket.recv_multipart(zmq.NOBLOCK)
+            try:
+                request_id, reply = decode_reply(header)
+            except VersionError as e:
+                raise ProtocolError(f"{self.address}: {e}. Install the same bricktrack on both ends") from e
+            except ProtocolError as e:
+                logger.debug("%s: foreign message: %s", self.address, e)
+                self.counts.foreign_messages += 1
+                continue
+            if len(rest) != (1 if isinstance(reply, Chunk) else 0):
+                self.counts.foreign_messages += 1
+                continue
+            return request_id, reply, rest[0] if rest else b""
+
+    def _wait_for(self, event: int, deadline_s: float, problem: str) -> None:
+        while True:
+            if self._stop is not None and self._stop.is_set():
+                raise Stopped
+            left_ms = (deadline_s - time.monotonic()) * 1000
+            if self._socket.poll(int(min(max(left_ms, 0), _POLL_MS)), event):
+                return
+            if left_ms <= 0:
+                foreign = self.counts.foreign_messages
+                raise UnitTimeoutError(
+                    f"{self.address}: {problem} in time. Is the unit on, bricktrackd running and the address "
+                    "right?" + (f" {foreign} messages came that are not bricktrack's" if foreign else "")
+                )
+
+
+def _chunk_problem(reply: Chunk, data: bytes, run_id: str, file_index: int, chunk: _Asked) -> str:
+    """Return in words why a chunk is not the one that was asked for, or is broken; else ``""``."""
+    where = f"the chunk at byte {chunk.offset} of file {file_index} of {run_id}"
+    if (reply.run_id, reply.file_index, reply.offset) != (run_id, file_index, chunk.offset):
+        return f"{where} came as byte {reply.offset} of file {reply.file_index} of {reply.run_id}"
+    if len(data) != chunk.length or reply.n_bytes != chunk.length:
+        return f"{where} has {len(data)} bytes instead of {chunk.length}"
+    if crc32(data) != reply.crc32:
+        return f"{where} does not match its checksum"
+    return ""
