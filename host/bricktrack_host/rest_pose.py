@@ -1,0 +1,202 @@
+"""The rest pose: where the brick stood while nothing moved, from which displacements are counted (tare)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.errors import TrackingError
+from bricktrack_common.poses import Pose
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_host.tracks import ImuTrack, OpticalTrack
+
+MIN_FRAMES = 4  # three steps: a vibrating brick stands still for one step at its turning point, not for three
+_STILL_MM = 0.05  # steps below this are rest whatever the covariance promises
+_STILL_RAD = np.deg2rad(0.05)
+_STILL_GYRO_RADPS = np.deg2rad(1.0)
+_STILL_ACC_MPS2 = 0.5
+_N_SD = 5.0
+_N_IN_A_ROW = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RestPose:
+    """The brick's pose at rest.
+
+    Attributes
+    ----------
+    R_camera_rest : ndarray, shape (3, 3)
+        Takes the brick's axes at rest to camera axes.
+    t_camera_rest_mm : ndarray, shape (3,), mm, camera frame
+    interval_ns : (int, int), CLOCK_MONOTONIC of the unit
+        First and last frame instant that was used.
+    n_frames : int
+        Frames that the mean is of.
+    spread_mm, spread_rad : ndarray, shape (3,)
+        Standard deviation of single frames about the mean: position in camera axes, rotation in brick axes.
+    source : "found" or "given"
+        Whether the interval was found by stillness or told.
+    """
+
+    R_camera_rest: FloatArray
+    t_camera_rest_mm: FloatArray
+    interval_ns: tuple[int, int]
+    n_frames: int
+    spread_mm: FloatArray
+    spread_rad: FloatArray
+    source: Literal["found", "given"]
+
+    def relative(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> Pose:
+        """Return the pose of the brick seen from its own rest pose, in the brick's axes at rest.
+
+        Parameters
+        ----------
+        R_camera_brick : ndarray, shape (..., 3, 3)
+        t_camera_brick_mm : ndarray, shape (..., 3), mm
+        """
+        pose_camera_brick = Pose(R_camera_brick, t_camera_brick_mm)
+        R_rest_camera = self.R_camera_rest.T
+        return Pose(
+            R_rest_camera @ pose_camera_brick.R,
+            (pose_camera_brick.t_mm - self.t_camera_rest_mm) @ R_rest_camera.T,
+        )
+
+
+def tare(
+    optical: OpticalTrack,
+    imu: ImuTrack | None = None,
+    *,
+    interval_ns: tuple[int, int] | None = None,
+    imu_minus_camera_ns: int = 0,
+) -> RestPose:
+    """Return the robust mean pose over the quiet interval before the shake.
+
+    Without ``interval_ns`` the interval is the first in which the optical pose stands still from frame to
+    frame for at least four frames, ended where the pose leaves the interval's median, or where the gyroscope
+    or the accelerometer begin to move.
+
+    Parameters
+    ----------
+    optical : OpticalTrack
+    imu : ImuTrack, optional
+        Sees the beginning of the shake earlier than the camera.
+    interval_ns : (int, int), optional
+        First and last instant to use, CLOCK_MONOTONIC of the unit.
+    imu_minus_camera_ns : int, ns
+        Stamp of an inertial sample less the camera's stamp of the same instant.
+
+    Raises
+    ------
+    TrackingError
+        If no interval is quiet, or the one given holds fewer than four poses.
+    """
+    has_position = np.isfinite(optical.t_camera_brick_mm).all(axis=1)
+    valid = np.asarray(has_position & np.isfinite(optical.R_camera_brick).all(axis=(1, 2)))
+    if interval_ns is not None:
+        first, last = interval_ns
+        chosen = valid & (optical.t_ns >= first) & (optical.t_ns <= last)
+        if np.count_nonzero(chosen) < MIN_FRAMES:
+            raise TrackingError(
+                f"rest interval {first}..{last} ns holds {np.count_nonzero(chosen)} poses; expected at least "
+                f"{MIN_FRAMES}. Choose an interval in which the brick stands still and is seen"
+            )
+        return _mean_pose(optical, np.flatnonzero(chosen), "given")
+    frames = _first_still_frames(optical, valid)
+    if imu is not None and frames.size:
+        onset_ns = _inertial_onset_ns(imu, imu_minus_camera_ns, optical.t_ns[frames])
+        if onset_ns is not None:
+            frames = frames[optical.t_ns[frames] < onset_ns]
+    if frames.size < MIN_FRAMES:
+        raise TrackingError(
+            f"no rest before the shake: the brick never stood still for {MIN_FRAMES} frames in a row. "
+            "Start the recording earlier, or give the interval in which it rests"
+        )
+    return _mean_pose(optical, frames, "found")
+
+
+def _first_still_frames(optical: OpticalTrack, valid: BoolArray) -> IntArray:
+    """Return the indices of the first frames that stand still; empty where none do."""
+    index = np.flatnonzero(valid)
+    if index.size < MIN_FRAMES:
+        return np.empty(0, dtype=np.int64)
+    t_mm = optical.t_camera_brick_mm[index]
+    R = optical.R_camera_brick[index]
+    sd_mm, sd_rad = _pose_sd(optical.covariance[index])
+    step_mm = np.linalg.norm(np.diff(t_mm, axis=0), axis=1)
+    step_rad = np.linalg.norm(rvec_from_matrix(np.swapaxes(R[:-1], -1, -2) @ R[1:]), axis=1)
+    limit_mm = np.maximum(_STILL_MM, _N_SD * np.hypot(sd_mm[:-1], sd_mm[1:]))
+    limit_rad = np.maximum(_STILL_RAD, _N_SD * np.hypot(sd_rad[:-1], sd_rad[1:]))
+    still = (step_mm < limit_mm) & (step_rad < limit_rad)
+    edges = np.diff(np.concatenate([[0], still.astype(np.int8), [0]]))
+    for start, stop in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        n = stop - start + 1
+        if n < MIN_FRAMES:
+            continue
+        # A slow start drifts off in small steps: end where the pose leaves the median of what came before.
+        run = np.arange(start, stop + 1)
+        keep = MIN_FRAMES
+        while keep < n:
+            head, i = run[:keep], run[keep]
+            off_mm = np.linalg.norm(t_mm[i] - np.median(t_mm[head], axis=0))
+            turns = rvec_from_matrix(R[head[0]].T @ R[run[: keep + 1]])
+            off_rad = np.linalg.norm(turns[-1] - np.median(turns[:-1], axis=0))
+            if off_mm > max(_STILL_MM, _N_SD * sd_mm[i]) or off_rad > max(_STILL_RAD, _N_SD * sd_rad[i]):
+                break
+            keep += 1
+        return np.asarray(index[run[:keep]])
+    return np.empty(0, dtype=np.int64)
+
+
+def _inertial_onset_ns(imu: ImuTrack, imu_minus_camera_ns: int, frames_ns: IntArray) -> int | None:
+    """Return when the inertial sensor begins to move within the span of the frames, camera's time."""
+    t_ns = imu.t_ns - imu_minus_camera_ns
+    span = (t_ns <= frames_ns[-1]) & np.isfinite(imu.gyro_radps).all(axis=1)
+    span &= np.isfinite(imu.acc_mps2).all(axis=1)
+    inside = np.flatnonzero(span)
+    # The noise is that of the first half of what can be rest.
+    head = inside[: max(len(inside) // 2, 8)]
+    if head.size < 8:
+        return None
+    moving = np.zeros(inside.size, dtype=np.bool_)
+    for values, floor in ((imu.gyro_radps, _STILL_GYRO_RADPS), (imu.acc_mps2, _STILL_ACC_MPS2)):
+        centre = np.median(values[head], axis=0)
+        sd = 1.4826 * np.median(np.abs(values[head] - centre), axis=0)
+        moving |= (np.abs(values[inside] - centre) > np.maximum(floor, _N_SD * sd)).any(axis=1)
+    in_a_row = np.convolve(moving, np.ones(_N_IN_A_ROW), "valid") == _N_IN_A_ROW
+    begins = inside[np.flatnonzero(in_a_row)]
+    begins = begins[t_ns[begins] >= frames_ns[0]]
+    return int(t_ns[begins[0]]) if begins.size else None
+
+
+def _mean_pose(optical: OpticalTrack, frames: IntArray, source: Literal["found", "given"]) -> RestPose:
+    """Return the mean of poses, without those beyond five robust deviations of the median."""
+    t_mm = optical.t_camera_brick_mm[frames]
+    R = optical.R_camera_brick[frames]
+    R_start = R[len(R) // 2]
+    turns_rad = rvec_from_matrix(R_start.T @ R)
+    keep = np.ones(len(frames), dtype=np.bool_)
+    for values, floor in ((t_mm, 1e-3), (turns_rad, 1e-5)):
+        off = np.abs(values - np.median(values, axis=0))
+        keep &= (off <= np.maximum(_N_SD * 1.4826 * np.median(off, axis=0), floor)).all(axis=1)
+    if np.count_nonzero(keep) < MIN_FRAMES:
+        keep[:] = True
+    used = frames[keep]
+    mean_turn_rad = turns_rad[keep].mean(axis=0)
+    return RestPose(
+        R_camera_rest=R_start @ matrix_from_rvec(mean_turn_rad),
+        t_camera_rest_mm=t_mm[keep].mean(axis=0),
+        interval_ns=(int(optical.t_ns[used[0]]), int(optical.t_ns[used[-1]])),
+        n_frames=int(used.size),
+        spread_mm=t_mm[keep].std(axis=0, ddof=1),
+        spread_rad=turns_rad[keep].std(axis=0, ddof=1),
+        source=source,
+    )
+
+
+def _pose_sd(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the deviations of position, mm, and rotation, rad, as one number a frame each; 0 for NaN."""
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    sd_mm = np.sqrt(np.maximum(variance[:, 3:].sum(axis=1), 0))
+    sd_rad = np.sqrt(np.maximum(variance[:, :3].sum(axis=1), 0))
+    return np.nan_to_num(sd_mm), np.nan_to_num(sd_rad)
