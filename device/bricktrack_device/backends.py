@@ -1,0 +1,33 @@
+"""The only module that chooses between simulation and hardware."""
+
+from collections.abc import Callable
+
+from bricktrack_common.errors import ConfigError
+from bricktrack_device.config import DeviceConfig
+from bricktrack_device.interfaces import Rig
+
+
+def _open_sim(config: DeviceConfig) -> Rig:
+    from bricktrack_device.sim.sim_rig import SimRig  # PyAV is only needed, and installed, for this
+
+    return SimRig(config.sim)
+
+
+BACKENDS: dict[str, Callable[[DeviceConfig], Rig]] = {"sim": _open_sim}
+
+
+def open_rig(config: DeviceConfig) -> Rig:
+    """Return the rig that the configuration names.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such backend.
+    """
+    try:
+        opener = BACKENDS[config.backend]
+    except KeyError:
+        raise ConfigError(
+            f"backend: {config.backend!r} does not exist here; expected one of: {', '.join(sorted(BACKENDS))}"
+        ) from None
+    return opener(config)

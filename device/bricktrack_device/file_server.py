@@ -1,0 +1,224 @@
+"""The unit's side of the wire: one ROUTER socket, one thread, typed requests in, typed replies out.
+
+Bytes that are no message of the protocol are refused with a code and words; nothing that comes in ends the
+thread. `docs/wire-protocol.md` describes every message.
+"""
+
+import ipaddress
+import logging
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import msgpack
+import zmq
+
+from bricktrack_common.errors import DeviceError, ProtocolError
+from bricktrack_common.wire_messages import (
+    MAX_HEADER_BYTES,
+    ErrorCode,
+    Refusal,
+    Reply,
+    Request,
+    VersionError,
+    decode_request,
+    encode_message,
+)
+from bricktrack_device.refusals import RequestRefusedError
+
+logger = logging.getLogger(__name__)
+
+HEARTBEAT_IVL_MS = 2000
+HEARTBEAT_TIMEOUT_MS = 6000
+HANDSHAKE_IVL_MS = 5000
+LINGER_MS = 500
+SEND_HWM = 32
+"""Replies that may wait for one slow host; at the largest chunk that is 32 MiB of memory."""
+_MAX_WORDS = 2000
+_POLL_MS = 500
+
+Answer = Callable[[Reply, bytes | None], None]
+"""Sends one reply, with file bytes behind a `Chunk`; may be called later and from any thread, once."""
+
+
+class RequestHandler(Protocol):
+    """Who knows the answers."""
+
+    def handle(self, request: Request, answer: Answer) -> None:
+        """Answer now or later; a `RequestRefusedError` is turned into a `Refusal`."""
+        ...
+
+
+class FileServer:
+    """The socket and its thread.
+
+    Parameters
+    ----------
+    address : str
+        An IP address; without keys only a loopback one.
+    port : int
+        0 takes a free one; see `port`.
+    handler : RequestHandler
+        Called in the server's thread.
+
+    Raises
+    ------
+    DeviceError
+        If the address is not loopback, or taken.
+    """
+
+    def __init__(self, address: str, port: int, handler: RequestHandler) -> None:
+        parsed = ipaddress.ip_address(address)
+        if not parsed.is_loopback:
+            raise DeviceError(f"{address} is not a loopback address; without keys nothing else is served")
+        self._handler = handler
+        self._replies: queue.SimpleQueue[tuple[bytes, int, Reply, bytes | None]] = queue.SimpleQueue()
+        self._wake_out, self._wake_in = socket.socketpair()
+        self._wake_in.setblocking(False)
+        self._stopping = threading.Event()
+        self._last_beat = time.monotonic()
+        self._context = zmq.Context()
+        self._socket: zmq.Socket[bytes] = self._context.socket(zmq.ROUTER)
+        for option, value in (
+            (zmq.ROUTER_MANDATORY, 1),
+            (zmq.HEARTBEAT_IVL, HEARTBEAT_IVL_MS),
+            (zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS),
+            (zmq.HANDSHAKE_IVL, HANDSHAKE_IVL_MS),
+            (zmq.LINGER, LINGER_MS),
+            (zmq.MAXMSGSIZE, MAX_HEADER_BYTES),
+            (zmq.SNDHWM, SEND_HWM),
+            (zmq.IPV6, int(parsed.version == 6)),
+        ):
+            self._socket.setsockopt(option, value)
+        host = f"[{address}]" if parsed.version == 6 else address
+        try:
+            self._socket.bind(f"tcp://{host}:{port or '*'}")
+        except zmq.ZMQError as e:
+            self._release()
+            remedy = (
+                "another program, perhaps another bricktrackd, has it. Stop that one or set server.port"
+                if e.errno == zmq.EADDRINUSE
+                else f"{e.strerror}. Set server.address and server.port"
+            )
+            raise DeviceError(f"cannot listen on {address} port {port}: {remedy}") from e
+        self.address = address
+        self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+        self._thread = threading.Thread(target=self._run, name="file-server")
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread and close the socket; replies that were given are still sent, for half a second."""
+        self._stopping.set()
+        self._wake()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._release()
+
+    @property
+    def beat_age_s(self) -> float:
+        """Seconds since the thread was last seen at work; infinite once it is gone."""
+        return time.monotonic() - self._last_beat if self._thread.is_alive() else float("inf")
+
+    def _release(self) -> None:
+        self._socket.close(LINGER_MS)
+        self._context.term()
+        self._wake_out.close()
+        self._wake_in.close()
+
+    def _wake(self) -> None:
+        try:
+            self._wake_in.send(b"\0")
+        except BlockingIOError:
+            return  # the pipe is full of wake-ups already
+        except OSError:
+            logger.debug("a reply came after the server was closed")
+
+    def _run(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._wake_out, zmq.POLLIN)
+        while not self._stopping.is_set():
+            self._last_beat = time.monotonic()
+            ready = dict(poller.poll(_POLL_MS))
+            if self._wake_out.fileno() in ready:
+                self._wake_out.recv(4096)
+            self._send_waiting()
+            if self._socket in ready:
+                try:
+                    self._receive()
+                except Exception:
+                    logger.exception("a bug in the file server; the request is dropped")
+                self._send_waiting()
+        self._send_waiting()
+
+    def _receive(self) -> None:
+        try:
+            identity, *frames = self._socket.recv_multipart(zmq.NOBLOCK)
+        except zmq.Again:
+            return
+        header = frames[0] if frames else b""
+        try:
+            if len(frames) != 1:
+                raise ProtocolError(f"a request is one frame; this message has {len(frames)}")
+            request_id, request = decode_request(header)
+        except VersionError as e:
+            self._put(identity, _request_id_in(header), _refusal("bad-version", str(e)), None)
+            return
+        except ProtocolError as e:
+            logger.debug("refused %d bytes: %s", len(header), e)
+            self._put(identity, _request_id_in(header), _refusal("bad-message", str(e)), None)
+            return
+
+        def answer(reply: Reply, data: bytes | None = None) -> None:
+            self._put(identity, request_id, reply, data)
+            self._wake()
+
+        try:
+            self._handler.handle(request, answer)
+        except RequestRefusedError as e:
+            answer(_refusal(e.code, str(e)))
+        except Exception as e:
+            answer(_refusal("internal", f"{type(e).__name__}: {e}"))
+            raise
+
+    def _put(self, identity: bytes, request_id: int, reply: Reply, data: bytes | None) -> None:
+        self._replies.put((identity, request_id, reply, data))
+
+    def _send_waiting(self) -> None:
+        while True:
+            try:
+                identity, request_id, reply, data = self._replies.get_nowait()
+            except queue.Empty:
+                return
+            frames = [identity, encode_message(request_id, reply)]
+            if data is not None:
+                frames.append(data)
+            try:
+                self._socket.send_multipart(frames, zmq.NOBLOCK)
+            except zmq.ZMQError as e:
+                # EHOSTUNREACH: the host has gone. EAGAIN: it does not take its replies. It will ask again.
+                logger.debug("reply %d not sent: %s", request_id, e.strerror)
+
+
+def _refusal(code: ErrorCode, words: str) -> Refusal:
+    return Refusal(code=code, message=words[:_MAX_WORDS])
+
+
+def _request_id_in(header: bytes) -> int:
+    """Return the id in a message that was refused, if it has one, so that the host can tell which it was."""
+    if len(header) > MAX_HEADER_BYTES:
+        return 0
+    try:
+        value = msgpack.unpackb(header, raw=False, strict_map_key=True, max_ext_len=0)
+    except (ValueError, TypeError, OverflowError, msgpack.UnpackException):
+        return 0
+    request_id = value.get("request_id") if isinstance(value, dict) else None
+    if isinstance(request_id, int) and not isinstance(request_id, bool) and 0 <= request_id <= 2**53:
+        return request_id
+    return 0

@@ -1,0 +1,427 @@
+"""The unit's one thread of control: armed, recording, saving, one run at a time.
+
+Everything that changes the state happens in this thread; commands come in through a queue and are answered
+through the callback that they bring.
+"""
+
+import errno
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from bricktrack_common.clocks import check_monotonic_is_boottime, monotonic_ns, read_clock_triplet
+from bricktrack_common.errors import BricktrackError, StorageError
+from bricktrack_common.wire_messages import (
+    Armed,
+    DaemonState,
+    Disarmed,
+    ErrorCode,
+    ImuStatus,
+    Refusal,
+    Reply,
+)
+from bricktrack_device.config import DeviceConfig
+from bricktrack_device.interfaces import Rig
+from bricktrack_device.recording import Recording, save
+from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.run_store import RunStore, RunWriter
+from bricktrack_device.session import RING_SLACK_S, Session
+from bricktrack_device.state_table import Cause, StateMachine
+
+logger = logging.getLogger(__name__)
+
+Answer = Callable[[Reply], None]
+
+_TICK_S = 0.02
+_IDLE_TICK_S = 0.2
+_RETRY_S = 10.0
+_MEMINFO = Path("/proc/meminfo")
+
+
+@dataclass(frozen=True, slots=True)
+class _Arm:
+    label: str
+    duration_s: float | None
+    answer: Answer
+
+
+@dataclass(frozen=True, slots=True)
+class _Disarm:
+    answer: Answer
+
+
+@dataclass(frozen=True, slots=True)
+class _Wake:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class _Unsaved:
+    recording: Recording
+    writer: RunWriter
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """How the recorder is, at one moment; see `bricktrack_common.wire_messages.StatusReply`."""
+
+    state: DaemonState
+    reason: str
+    run_id: str
+    frames: int
+    frame_age_ms: float | None
+    imus: list[ImuStatus]
+    edges: int
+    line_is_high: bool | None
+    last_error: str
+    disk_needed_bytes: int
+
+
+class _StoppingError(BricktrackError):
+    """The daemon is told to end while it waits for a sensor."""
+
+
+class Recorder:
+    """See the module's first lines.
+
+    Parameters
+    ----------
+    config : DeviceConfig
+    rig : Rig
+    store : RunStore
+    """
+
+    def __init__(self, config: DeviceConfig, rig: Rig, store: RunStore) -> None:
+        self._config = config
+        self._rig = rig
+        self._store = store
+        self._machine = StateMachine()
+        self._inbox: queue.SimpleQueue[_Arm | _Disarm | _Wake] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="recorder")
+        self._stopping = threading.Event()
+        self._session: Session | None = None
+        self._unsaved: _Unsaved | None = None
+        self._auto_arm = config.recording.auto_arm
+        self._try_again_at = 0.0
+        self._last_error = ""
+        self._doing = ""
+        self._last_beat = time.monotonic()
+
+    # From other threads
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End: a recording under way is saved as far as it got, and marked. Returns when that is done."""
+        self._stopping.set()
+        self._inbox.put(_Wake())
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def arm(self, label: str, duration_s: float | None, answer: Answer) -> None:
+        """Ask to arm; answered with `Armed` when the unit is ready, or a `Refusal`."""
+        self._inbox.put(_Arm(label, duration_s, answer))
+
+    def disarm(self, answer: Answer) -> None:
+        """Ask to go back to idle, or to leave a fault; answered with `Disarmed` or a `Refusal`."""
+        self._inbox.put(_Disarm(answer))
+
+    @property
+    def state(self) -> DaemonState:
+        """The present state."""
+        return self._machine.state
+
+    @property
+    def beat_age_s(self) -> float:
+        """Seconds since the thread was last seen at work; infinite once it is gone."""
+        return time.monotonic() - self._last_beat if self._thread.is_alive() else float("inf")
+
+    def status(self) -> RecorderStatus:
+        """Return how things are."""
+        session = self._session
+        newest_us = session.ring.newest_us if session else None
+        trigger = session.trigger if session else None
+        return RecorderStatus(
+            state=self.state,
+            reason=self._machine.reason or self._doing,
+            run_id=session.run_id if session else "",
+            frames=session.ring.n_packets if session else 0,
+            frame_age_ms=None if newest_us is None else (monotonic_ns() - newest_us * 1000) / 1e6,
+            imus=[i.status() for i in list(session.imus)] if session else [],
+            edges=trigger.n_edges if trigger else 0,
+            line_is_high=trigger.line_is_high if trigger else None,
+            last_error=self._last_error,
+            disk_needed_bytes=self._disk_needed_bytes(None),
+        )
+
+    # The thread
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            self._last_beat = time.monotonic()
+            try:
+                command = self._inbox.get(timeout=_TICK_S if self._session else _IDLE_TICK_S)
+            except queue.Empty:
+                command = _Wake()
+            try:
+                self._obey(command)
+                self._go_on()
+            except Exception as e:
+                logger.exception("a bug in the recorder")
+                self._save_what_there_is(f"internal error: {type(e).__name__}: {e}")
+        self._end()
+
+    def _beat(self) -> None:
+        """Say that the thread is at work; give up waiting when the daemon is told to end."""
+        self._last_beat = time.monotonic()
+        if self._stopping.is_set():
+            raise _StoppingError("the daemon is stopping")
+
+    def _obey(self, command: _Arm | _Disarm | _Wake) -> None:
+        if isinstance(command, _Wake):
+            return
+        try:
+            if isinstance(command, _Arm):
+                session = self._arm(command.label, command.duration_s)
+                self._auto_arm = self._config.recording.auto_arm
+                command.answer(Armed(run_id=session.run_id, missing=[m[:2000] for m in session.missing]))
+            else:
+                self._disarm()
+                command.answer(Disarmed())
+        except RequestRefusedError as e:
+            command.answer(Refusal(code=e.code, message=str(e)[:2000]))
+        except StorageError as e:
+            code: ErrorCode = "no-space" if e.errno == errno.ENOSPC else "not-ready"
+            command.answer(Refusal(code=code, message=str(e)[:2000]))
+        except BricktrackError as e:
+            command.answer(Refusal(code="not-ready", message=str(e)[:2000]))
+        except Exception as e:
+            command.answer(Refusal(code="internal", message=f"{type(e).__name__}: {e}"[:2000]))
+            raise
+
+    def _go_on(self) -> None:
+        """Do what is due in the present state."""
+        session = self._session
+        if session is not None:
+            session.poll()
+            if self.state == "armed":
+                if session.t0_ns is not None:
+                    self._change("first-edge")
+                    session.note_trigger()
+                elif not session.has_sensors:
+                    self._fail("no sensor is left: " + "; ".join(session.missing))
+            elif self.state == "recording" and session.is_over(monotonic_ns()):
+                self._finish()
+        elif self.state == "fault" and self._unsaved and time.monotonic() >= self._try_again_at:
+            self._try_again_at = time.monotonic() + _RETRY_S
+            if self._store.free_bytes() > self._unsaved.recording.n_bytes + (1 << 20):
+                self._save_again()
+        elif self.state == "idle" and self._auto_arm and time.monotonic() >= self._try_again_at:
+            self._try_again_at = time.monotonic() + _RETRY_S
+            try:
+                self._arm(self._config.recording.label, None)
+            except BricktrackError as e:
+                self._note_error(f"cannot arm itself: {e}")
+
+    # Arming and disarming
+
+    def _arm(self, label: str, duration_s: float | None) -> Session:
+        self._must_allow("arm")
+        self._doing = "arming"
+        try:
+            duration_s = duration_s or self._config.recording.duration_s
+            check_monotonic_is_boottime(read_clock_triplet())
+            self._check_space(duration_s)
+            session = Session(
+                self._config,
+                self._rig,
+                run_id=self._store.new_run_id(label),
+                label=label,
+                duration_s=duration_s,
+                beat=self._beat,
+            )
+            self._session = session
+            try:
+                session.open(lambda: self._inbox.put(_Wake()))
+            except BaseException:
+                self._session = None
+                session.close()
+                raise
+        finally:
+            self._doing = ""
+        self._last_error = ""
+        self._change("arm")
+        return session
+
+    def _disarm(self) -> None:
+        if self.state == "fault" and self._unsaved is not None:
+            self._save_again()
+            if self._unsaved is not None:
+                raise RequestRefusedError(
+                    "no-space",
+                    f"run {self._unsaved.recording.run_id} is still only in memory: {self._machine.reason}",
+                )
+        self._auto_arm = False
+        if self.state == "idle":
+            return
+        self._must_allow("disarm")
+        self._close_session()
+        self._change("disarm")
+
+    def _must_allow(self, cause: Cause) -> None:
+        if self._machine.allows(cause):
+            return
+        session = self._session
+        of_run = f" run {session.run_id}" if session else ""
+        remedies: dict[DaemonState, str] = {
+            "armed": "disarm it first",
+            "recording": "the recording ends by itself",
+            "saving": "wait until the run is saved",
+            "fault": f"{self._machine.reason}. Disarm clears the fault",
+        }
+        words = remedies.get(self.state, "nothing to do")
+        raise RequestRefusedError("wrong-state", f"the unit is {self.state}{of_run}: {words}")
+
+    def _disk_needed_bytes(self, duration_s: float | None) -> int:
+        return 2 * self._config.video_bytes(duration_s) + self._config.storage.margin_mb * 1_000_000
+
+    def _check_space(self, duration_s: float) -> None:
+        needed, free = self._disk_needed_bytes(duration_s), self._store.free_bytes()
+        if free < needed:
+            raise RequestRefusedError(
+                "no-space",
+                f"{free / 1e6:.0f} MB are free in {self._store.folder}; a run of {duration_s:g} s needs "
+                f"{needed / 1e6:.0f} MB (twice its video and a margin). Pull and delete runs first",
+            )
+        held = self._config.video_bytes(duration_s + RING_SLACK_S)
+        available = _memory_available_bytes()
+        if available is not None and available < 1.3 * held:
+            raise RequestRefusedError(
+                "not-ready",
+                f"{available / 1e6:.0f} MB of memory are available; a run of {duration_s:g} s at "
+                f"{self._config.camera.bitrate_bps / 1e6:g} Mbit/s needs {1.3 * held / 1e6:.0f} MB. Record "
+                "for a shorter time or lower camera.bitrate_bps",
+            )
+
+    # Ending a run
+
+    def _finish(self, *, interrupted: str = "") -> None:
+        session = self._session
+        if session is None:
+            return
+        recording = session.collect(interrupted=interrupted)
+        ended = time.monotonic()
+        self._change("stop" if interrupted else "window-over")
+        self._close_session()
+        closed = time.monotonic()
+        self._unsaved = _Unsaved(recording, self._store.open_writer(recording.run_id))
+        if self._save_unsaved():
+            logger.info(
+                "%s: saved %.2f s after the recording ended (%.2f s of it to stop the sensors)",
+                recording.run_id, time.monotonic() - ended, closed - ended,
+            )  # fmt: skip
+
+    def _save_again(self) -> None:
+        self._change("save-again")
+        self._save_unsaved()
+
+    def _save_unsaved(self) -> bool:
+        unsaved = self._unsaved
+        if unsaved is None:
+            return False
+        start_ns, end_ns = unsaved.recording.truth_window_ns
+        try:
+            save(
+                unsaved.recording,
+                unsaved.writer,
+                lambda folder: self._rig.write_truth(folder, start_ns=start_ns, end_ns=end_ns),
+            )
+        except StorageError as e:
+            self._try_again_at = time.monotonic() + _RETRY_S
+            reason = f"{e}. The run is kept in memory and saved when that works again"
+            self._note_error(reason)
+            self._change("save-failed", reason=reason)
+            return False
+        self._unsaved = None
+        self._try_again_at = 0.0
+        self._change("saved", run_id=unsaved.recording.run_id)
+        for words in unsaved.recording.missing:
+            logger.warning("%s: %s", unsaved.recording.run_id, words)
+        return True
+
+    def _end(self) -> None:
+        """Leave everything in order when the daemon stops."""
+        try:
+            if self.state == "recording" and self._session is not None:
+                seconds = (monotonic_ns() - (self._session.t0_ns or 0)) / 1e9
+                self._finish(interrupted=f"the daemon was stopped {seconds:.1f} s after t = 0")
+            elif self.state == "armed":
+                self._close_session()
+                self._change("stop")
+            elif self._unsaved is not None:
+                self._save_again()
+        except Exception:
+            logger.exception("a bug in the recorder while it ends")
+        finally:
+            self._close_session()
+        if self._unsaved is not None:
+            logger.error(
+                "%s: lost from memory; its folder holds what was saved", self._unsaved.recording.run_id
+            )
+        while not self._inbox.empty():
+            command = self._inbox.get()
+            if not isinstance(command, _Wake):
+                command.answer(Refusal(code="not-ready", message="the daemon is stopping"))
+
+    def _save_what_there_is(self, reason: str) -> None:
+        """Go to fault after a bug, but not before a recording under way is on the card."""
+        if self.state == "recording":
+            try:
+                self._finish(interrupted=reason)
+            except Exception:
+                logger.exception("a second bug, while the recording was saved")
+        self._fail(reason)
+
+    def _fail(self, reason: str) -> None:
+        """Go to fault from wherever the unit is."""
+        self._try_again_at = time.monotonic() + _RETRY_S
+        self._note_error(reason)
+        self._close_session()
+        self._change("failure", reason=reason)
+
+    def _close_session(self) -> None:
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()
+
+    def _change(self, cause: Cause, *, reason: str = "", run_id: str = "") -> None:
+        change = self._machine.change(cause, reason=reason)
+        session = self._session
+        of_run = run_id or (session.run_id if session else "")
+        logger.info(
+            "%s -> %s (%s)%s%s",
+            change.before, change.after, change.cause, f" {of_run}" if of_run else "",
+            f": {reason}" if reason else "",
+        )  # fmt: skip
+
+    def _note_error(self, words: str) -> None:
+        if words != self._last_error:
+            logger.warning("%s", words)
+        self._last_error = words[:2000]
+
+
+def _memory_available_bytes() -> int | None:
+    """Return what the kernel says can be had without swapping, or `None` where it does not say."""
+    try:
+        for line in _MEMINFO.read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError):
+        return None
+    return None

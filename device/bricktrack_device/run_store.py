@@ -1,0 +1,449 @@
+"""Run folders on the card: written beside their final name, synced, and renamed only when whole.
+
+::
+
+    <storage>/next_run.json        the counter that run ids take; survives reboots
+    <storage>/runs/<id>.partial/   being written, or left by a power cut
+    <storage>/runs/<id>/           whole: its manifest was written last
+    <storage>/confirmed/<id>.json  the host said that it holds these hashes
+
+Nothing is ever deleted here. A run exists when its manifest parses.
+"""
+
+import errno
+import fcntl
+import logging
+import os
+import re
+import shutil
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO, TextIO
+
+import msgspec
+
+from bricktrack_common.checksums import sha256_bytes
+from bricktrack_common.errors import RunFormatError, StorageError
+from bricktrack_common.run_manifest import (
+    FILE_NAME_PATTERN,
+    MANIFEST_NAME,
+    FileEntry,
+    RunManifest,
+    file_entry,
+    is_run_id,
+    read_manifest,
+)
+from bricktrack_common.typed_data import dump_json, load_json
+from bricktrack_common.wire_messages import ErrorCode, FileSummary, RunDescription, RunSummary
+from bricktrack_device.refusals import RequestRefusedError
+
+logger = logging.getLogger(__name__)
+
+PARTIAL_SUFFIX = ".partial"
+DRAFT_NAME = "draft.json"
+_COUNTER_IN_ID = re.compile(r"_[0-9a-f]{6}_(\d{4,})(?:_|$)")
+_MAX_LISTED = 10_000
+
+
+class _Counter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    next_run: int
+
+
+class _Confirmation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    run_id: str
+    sha256: list[str]
+
+
+class Disk:
+    """The few file operations that make a write survive a power cut; replaced in tests that cut it."""
+
+    def make_folder(self, folder: Path) -> None:
+        """Make a folder that must not exist, durably."""
+        folder.mkdir()
+        self.sync_folder(folder.parent)
+
+    def write_file(self, path: Path, fill: Callable[[BinaryIO], object]) -> None:
+        """Write a file with ``fill`` and make its contents durable."""
+        with path.open("wb") as file:
+            fill(file)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def sync_file(self, path: Path) -> None:
+        """Make the contents of a file that others wrote durable."""
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+
+    def sync_folder(self, folder: Path) -> None:
+        """Make the names in a folder durable."""
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def rename(self, old: Path, new: Path) -> None:
+        """Give a file or folder its final name, durably."""
+        old.rename(new)
+        self.sync_folder(new.parent)
+
+    def free_bytes(self, folder: Path) -> int:
+        """Return how much an ordinary user may still write."""
+        return shutil.disk_usage(folder).free
+
+
+class RunStore:
+    """All runs of a unit.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing.
+    unit : str
+    disk : Disk
+    boot_id : str or None
+        The kernel's, which tells the boots of one unit apart; read if not given.
+
+    Raises
+    ------
+    StorageError
+        If the folder cannot be made or written.
+    """
+
+    def __init__(
+        self, folder: Path, unit: str, *, disk: Disk | None = None, boot_id: str | None = None
+    ) -> None:
+        self.folder = folder
+        self.unit = unit
+        self._disk = disk or Disk()
+        self._boot = (boot_id or _kernel_boot_id()).replace("-", "")[:6]
+        self._lock = threading.Lock()
+        self._lock_file: TextIO | None = None
+        self._manifests: dict[str, tuple[RunManifest, FileSummary]] = {}
+        self._problems_told: set[str] = set()
+        self.runs = folder / "runs"
+        self._confirmed = folder / "confirmed"
+        try:
+            for path in (self.runs, self._confirmed):
+                path.mkdir(parents=True, exist_ok=True)
+            if not os.access(self.runs, os.W_OK):
+                raise PermissionError(errno.EACCES, "not writable")
+        except OSError as e:
+            raise StorageError(
+                f"storage folder {folder}: {e.strerror or e}. Set storage.folder (or --storage) to a "
+                "folder that this user can write"
+            ) from e
+
+    def lock(self) -> None:
+        """Keep other daemons off this folder, until this process ends or calls `unlock`.
+
+        Raises
+        ------
+        StorageError
+            If another one has it.
+        """
+        path = self.folder / "lock"
+        try:
+            self._lock_file = path.open("w")
+            fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as e:
+            self.unlock()
+            raise StorageError(
+                f"storage folder {self.folder} is in use by another bricktrackd. Stop that one, or set "
+                "storage.folder (or --storage) to another folder"
+            ) from e
+
+    def unlock(self) -> None:
+        """Let others have the folder."""
+        if self._lock_file is not None:
+            self._lock_file.close()
+            self._lock_file = None
+
+    # New runs
+
+    def new_run_id(self, label: str) -> str:
+        """Return an id that no run has, and note durably that it is taken.
+
+        Raises
+        ------
+        StorageError
+            If the counter cannot be written.
+        """
+        path = self.folder / "next_run.json"
+        number = 1 + max((_counter_of(p.name) for p in self._folders()), default=0)
+        try:
+            number = max(number, load_json(path, _Counter).next_run)
+        except RunFormatError as e:
+            if path.exists():
+                logger.warning("%s; counting on from the runs that are there", e)
+        try:
+            temporary = path.with_suffix(".tmp")
+            self._disk.write_file(temporary, lambda f: f.write(dump_json(_Counter(next_run=number + 1))))
+            self._disk.rename(temporary, path)
+        except OSError as e:
+            raise _storage_error(f"{path}: the run counter cannot be written", e) from e
+        return f"{self.unit}_{self._boot}_{number:04d}" + (f"_{label}" if label else "")
+
+    def free_bytes(self) -> int:
+        """Return the free space."""
+        return self._disk.free_bytes(self.folder)
+
+    def open_writer(self, run_id: str) -> "RunWriter":
+        """Return what writes one run."""
+        return RunWriter(self, run_id, self._disk)
+
+    # After a power cut
+
+    def recover(self, rebuild: Callable[[Path, str, str], RunManifest]) -> list[str]:
+        """Turn what a power cut left into runs: finish whole ones, mark the others interrupted.
+
+        Parameters
+        ----------
+        rebuild : callable
+            Makes a manifest (without files) over what a partial folder holds: folder, run id, unit.
+
+        Returns
+        -------
+        recovered : list of str
+            Run ids. What cannot be recovered stays where it is, with a warning.
+        """
+        recovered = []
+        for partial in sorted(self.runs.glob(f"*{PARTIAL_SUFFIX}")):
+            run_id = partial.name.removesuffix(PARTIAL_SUFFIX)
+            if not partial.is_dir() or not is_run_id(run_id):
+                logger.warning("%s: not a run folder's name; left alone", partial)
+                continue
+            final = self.runs / run_id
+            if final.exists():
+                logger.warning("%s: a run of this name exists already; left alone", partial)
+                continue
+            try:
+                if not _is_whole(partial):
+                    self._finish_interrupted(partial, rebuild(partial, run_id, self.unit))
+                (partial / DRAFT_NAME).unlink(missing_ok=True)
+                self._disk.rename(partial, final)
+            except OSError as e:
+                logger.warning("%s: cannot be recovered now: %s", partial, e.strerror or e)
+                continue
+            recovered.append(run_id)
+        return recovered
+
+    def _finish_interrupted(self, partial: Path, manifest: RunManifest) -> None:
+        entries = [file_entry(p) for p in sorted(partial.iterdir()) if _is_run_file(p)]
+        manifest = msgspec.structs.replace(manifest, state="interrupted", files=entries)
+        path = partial / MANIFEST_NAME
+        self._disk.write_file(path, lambda f: f.write(dump_json(manifest)))
+        self._disk.sync_folder(partial)
+
+    # Reading
+
+    def list_runs(self) -> list[RunSummary]:
+        """Return all whole runs, oldest first; at most the newest ten thousand."""
+        summaries = []
+        for folder in sorted(self._folders(), key=lambda p: (_counter_of(p.name), p.name))[-_MAX_LISTED:]:
+            try:
+                manifest, of_manifest = self._manifest(folder.name)
+            except RequestRefusedError as e:
+                if folder.name not in self._problems_told:
+                    self._problems_told.add(folder.name)
+                    logger.warning("%s", e)
+                continue
+            n_bytes = of_manifest.n_bytes + sum(f.n_bytes for f in manifest.files)
+            summaries.append(
+                RunSummary(
+                    run_id=folder.name,
+                    state=manifest.state,
+                    n_bytes=n_bytes,
+                    confirmed=(self._confirmed / f"{folder.name}.json").exists(),
+                )
+            )
+        return summaries
+
+    def count_runs(self) -> int:
+        """Return how many run folders there are."""
+        return sum(1 for _ in self._folders())
+
+    def describe(self, run_id: str) -> RunDescription:
+        """Return a run's files; index 0 is its manifest.
+
+        Raises
+        ------
+        RequestRefusedError
+            If there is no such run.
+        """
+        manifest, of_manifest = self._manifest(run_id)
+        files = [FileSummary(name=f.name, n_bytes=f.n_bytes, sha256=f.sha256) for f in manifest.files]
+        return RunDescription(run_id=run_id, files=[of_manifest, *files])
+
+    def read_chunk(self, run_id: str, file_index: int, offset: int, length: int) -> bytes:
+        """Return ``length`` bytes of a file from ``offset``, fewer at its end.
+
+        Raises
+        ------
+        RequestRefusedError
+            If there is no such run or file, or ``offset`` lies behind its end.
+        """
+        files = self.describe(run_id).files
+        if file_index >= len(files):
+            raise RequestRefusedError(
+                "no-such-file", f"run {run_id} has {len(files)} files; there is none with index {file_index}"
+            )
+        entry = files[file_index]
+        if offset > entry.n_bytes:
+            raise RequestRefusedError(
+                "out-of-range", f"{run_id}: {entry.name} has {entry.n_bytes} bytes; offset {offset} is behind"
+            )
+        try:
+            with (self.runs / run_id / entry.name).open("rb") as file:
+                file.seek(offset)
+                return file.read(min(length, entry.n_bytes - offset))
+        except OSError as e:
+            raise RequestRefusedError(
+                "internal", f"{run_id}: {entry.name} cannot be read: {e.strerror or e}"
+            ) from e
+
+    def confirm(self, run_id: str, sha256: list[str]) -> None:
+        """Note that the host holds a run: the hashes, in any order, must be those of all its files.
+
+        Raises
+        ------
+        RequestRefusedError
+            If there is no such run, a hash differs, or the note cannot be written.
+        """
+        files = self.describe(run_id).files
+        if sorted(sha256) != sorted(f.sha256 for f in files):
+            wrong = [f.name for f in files if f.sha256 not in sha256]
+            raise RequestRefusedError(
+                "hash-mismatch",
+                f"{run_id}: {len(sha256)} hashes do not match the {len(files)} files"
+                + (f"; differing: {', '.join(wrong)}" if wrong else ""),
+            )
+        path = self._confirmed / f"{run_id}.json"
+        note = dump_json(_Confirmation(run_id=run_id, sha256=sha256))
+        try:
+            temporary = path.with_suffix(".tmp")
+            self._disk.write_file(temporary, lambda f: f.write(note))
+            self._disk.rename(temporary, path)
+        except OSError as e:
+            code: ErrorCode = "no-space" if e.errno == errno.ENOSPC else "internal"
+            raise RequestRefusedError(code, f"{path}: {e.strerror or e}") from e
+
+    def _folders(self) -> list[Path]:
+        try:
+            return [p for p in self.runs.iterdir() if is_run_id(p.name) and p.suffix != PARTIAL_SUFFIX]
+        except OSError as e:
+            raise _storage_error(f"{self.runs}: cannot be listed", e) from e
+
+    def _manifest(self, run_id: str) -> tuple[RunManifest, FileSummary]:
+        """Return a run's manifest and the manifest file's own summary; both never change again."""
+        with self._lock:
+            known = self._manifests.get(run_id)
+            if known is not None:
+                return known
+            if not is_run_id(run_id) or run_id.endswith(PARTIAL_SUFFIX):
+                raise RequestRefusedError("no-such-run", f"{run_id!r:.120} is no run id")
+            path = self.runs / run_id / MANIFEST_NAME
+            if not path.parent.is_dir():
+                raise RequestRefusedError("no-such-run", f"there is no run {run_id} on this unit")
+            try:
+                manifest = read_manifest(path)
+                data = path.read_bytes()
+            except (RunFormatError, OSError) as e:
+                raise RequestRefusedError("no-such-run", f"run {run_id} cannot be read: {e}") from e
+            summary = FileSummary(name=MANIFEST_NAME, n_bytes=len(data), sha256=sha256_bytes(data))
+            self._manifests[run_id] = (manifest, summary)
+            return manifest, summary
+
+
+class RunWriter:
+    """Writes one run, file after file; after a failure it can be taken up again where it stopped."""
+
+    def __init__(self, store: RunStore, run_id: str, disk: Disk) -> None:
+        self._disk = disk
+        self._final = store.runs / run_id
+        self.folder = store.runs / (run_id + PARTIAL_SUFFIX)
+        self._entries: dict[str, FileEntry] = {}
+        self._others_wrote = False
+
+    def begin(self, draft: RunManifest) -> None:
+        """Make the folder and write down what is known already, for a recovery.
+
+        Raises
+        ------
+        StorageError
+            If that fails; so do all that follow.
+        """
+        try:
+            if not self.folder.is_dir():
+                self._disk.make_folder(self.folder)
+            self._disk.write_file(self.folder / DRAFT_NAME, lambda f: f.write(dump_json(draft)))
+        except OSError as e:
+            raise _storage_error(f"{self.folder}: cannot be begun", e) from e
+
+    def write(self, name: str, fill: Callable[[BinaryIO], object]) -> None:
+        """Write one file with ``fill``, durably; does nothing if it was written before."""
+        if name in self._entries:
+            return
+        path = self.folder / name
+        try:
+            self._disk.write_file(path, fill)
+            self._entries[name] = file_entry(path)
+        except OSError as e:
+            raise _storage_error(f"{path}: cannot be written", e) from e
+
+    def write_by_others(self, write_into: Callable[[Path], Path | None]) -> None:
+        """Let others write one file of their own into the folder, and take it in; does nothing twice."""
+        if self._others_wrote:
+            return
+        try:
+            path = write_into(self.folder)
+            if path is not None:
+                self._disk.sync_file(path)
+                self._entries[path.name] = file_entry(path)
+        except OSError as e:
+            raise _storage_error(f"{self.folder}: the true motion cannot be written", e) from e
+        self._others_wrote = True
+
+    def finish(self, manifest: RunManifest) -> Path:
+        """Write the manifest with the files' hashes, give the folder its name and return it."""
+        manifest = msgspec.structs.replace(manifest, files=list(self._entries.values()))
+        path = self.folder / MANIFEST_NAME
+        try:
+            self._disk.write_file(path, lambda f: f.write(dump_json(manifest)))
+            (self.folder / DRAFT_NAME).unlink(missing_ok=True)
+            self._disk.sync_folder(self.folder)
+            self._disk.rename(self.folder, self._final)
+        except OSError as e:
+            raise _storage_error(f"{path}: the run cannot be finished", e) from e
+        return self._final
+
+
+def _storage_error(what: str, error: OSError) -> StorageError:
+    remedy = ". Make room on the card" if error.errno == errno.ENOSPC else ""
+    storage_error = StorageError(f"{what}: {error.strerror or error}{remedy}")
+    storage_error.errno = error.errno
+    return storage_error
+
+
+def _counter_of(name: str) -> int:
+    found = _COUNTER_IN_ID.search(name)
+    return int(found.group(1)) if found else 0
+
+
+def _is_run_file(path: Path) -> bool:
+    is_own = path.name in (MANIFEST_NAME, DRAFT_NAME)
+    return path.is_file() and not is_own and re.fullmatch(FILE_NAME_PATTERN, path.name) is not None
+
+
+def _is_whole(folder: Path) -> bool:
+    """Tell whether only the renaming was cut off: the manifest and every hash are right."""
+    try:
+        manifest = read_manifest(folder / MANIFEST_NAME)
+        return all(file_entry(folder / f.name) == f for f in manifest.files)
+    except (RunFormatError, OSError):
+        return False
+
+
+def _kernel_boot_id() -> str:
+    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()

@@ -1,0 +1,320 @@
+"""All the sensors of one run, streaming from arming on: started together, watched, cut, and let go.
+
+One sensor failing stops no other: it is noted in words, and the run says what is missing.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from bricktrack_common.clocks import ClockTriplet, monotonic_ns, read_clock_triplet
+from bricktrack_common.errors import BricktrackError, HardwareError
+from bricktrack_common.run_manifest import CameraSection, ClocksSection
+from bricktrack_device.config import DeviceConfig
+from bricktrack_device.imu_reader import ImuReader
+from bricktrack_device.interfaces import Camera, Rig
+from bricktrack_device.recording import ImuRecording, Recording, RunLog
+from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.ring import FrameRing, VideoCut, cut_video
+from bricktrack_device.trigger import Trigger
+
+logger = logging.getLogger(__name__)
+
+CAMERA_START_TIMEOUT_S = 30.0
+CAMERA_STOP_TIMEOUT_S = 5.0
+FIRST_KEYFRAME_TIMEOUT_S = 10.0
+RING_SLACK_S = 5.0
+LATE_FRAMES_GRACE_S = 1.0
+"""How long after the window's end the last pictures may still come out of the encoder."""
+_SILENT_CAMERA_NS = 1_000_000_000
+_POLL_S = 0.01
+
+T = TypeVar("T")
+
+
+class Session:
+    """The sensors of one run.
+
+    Parameters
+    ----------
+    config : DeviceConfig
+    rig : Rig
+    run_id, label : str
+    duration_s : float
+    beat : callable
+        Called while waiting; raises to give up.
+    """
+
+    def __init__(
+        self,
+        config: DeviceConfig,
+        rig: Rig,
+        *,
+        run_id: str,
+        label: str,
+        duration_s: float,
+        beat: Callable[[], None],
+    ) -> None:
+        self.run_id = run_id
+        self.label = label
+        self.duration_s = duration_s
+        self.missing: list[str] = []
+        self.log = RunLog()
+        self._config = config
+        self._rig = rig
+        self._beat = beat
+        span_s = config.span_s(duration_s) + RING_SLACK_S
+        self.ring = FrameRing(round((span_s + config.camera.iperiod / config.camera.frame_rate_hz) * 1e9))
+        self._imu_span_s = span_s
+        self._camera: Camera | None = None
+        self._camera_section: CameraSection | None = None
+        self._camera_problem = ""
+        self.imus: list[ImuReader] = []
+        self._imu_problems_told: set[str] = set()
+        self.trigger: Trigger | None = None
+        self._t_armed_ns = 0
+        self._arm_triplet: ClockTriplet | None = None
+        self._trigger_triplet: ClockTriplet | None = None
+
+    # Arming
+
+    def open(self, on_first_edge: Callable[[], None]) -> None:
+        """Start every sensor, wait until they deliver, then watch the trigger.
+
+        Raises
+        ------
+        RequestRefusedError
+            If a required sensor does not start, or none does.
+        HardwareError
+            If the trigger's pin cannot be had.
+        """
+        for table in self._config.imu:
+            reader = ImuReader(
+                table, self._rig.bus_opener(table.bus), self._config.sampler, span_s=self._imu_span_s
+            )
+            self.imus.append(reader)
+            reader.start()
+        try:
+            self._start_camera()
+        except BricktrackError as e:
+            self._camera_problem = str(e)
+            if self._config.camera.required:
+                raise RequestRefusedError("not-ready", f"camera: {e}") from e
+            self._note_missing(f"camera: {e}")
+        self._wait_for_imus()
+        if not self.has_sensors:
+            raise RequestRefusedError("not-ready", "no sensor works: " + "; ".join(self.missing))
+        self._wait_for_pre_roll()
+        self.trigger = Trigger(self._rig.pin_factory(), self._config.trigger)
+        self._arm_triplet = read_clock_triplet()
+        self._t_armed_ns = self.trigger.arm(on_first_edge)
+        self.log.add("armed", run_id=self.run_id, line_is_high=self.trigger.line_is_high)
+        self._rig.on_armed(self._t_armed_ns)
+
+    def _start_camera(self) -> None:
+        camera = self._camera = self._rig.open_camera()
+        section = self._in_time("start", lambda: camera.start(self.ring), CAMERA_START_TIMEOUT_S)
+        self._camera_section = section
+        self.log.add("camera started", model=section.model, mode=section.mode.name, encoder=section.encoder)
+        deadline = time.monotonic() + FIRST_KEYFRAME_TIMEOUT_S
+        while self.ring.first_keyframe_us is None:
+            self._beat()
+            if time.monotonic() > deadline:
+                raise HardwareError(
+                    f"no keyframe came within {FIRST_KEYFRAME_TIMEOUT_S:g} s of starting "
+                    f"({self.ring.n_packets} pictures came). Check the camera's cable, then run "
+                    "'bricktrackd check'"
+                )
+            time.sleep(_POLL_S)
+
+    def _wait_for_imus(self) -> None:
+        while any(not i.is_ready and not i.problem for i in self.imus):
+            self._beat()
+            for reader in self.imus:
+                reader.poll()
+            time.sleep(_POLL_S)
+        for reader in self.imus:
+            if reader.problem:
+                self._imu_problems_told.add(reader.name)
+                if reader.settings.required:
+                    raise RequestRefusedError("not-ready", f"imu {reader.name}: {reader.problem}")
+                self._note_missing(f"imu {reader.name}: {reader.problem}")
+            else:
+                self.log.add("imu started", name=reader.name, scheduling=reader.scheduling)
+                for words in reader.warnings:
+                    logger.warning("imu %s: %s", reader.name, words)
+                    self.log.add("imu warning", name=reader.name, words=words)
+
+    def _wait_for_pre_roll(self) -> None:
+        """Wait until every sensor that works has delivered for as long as a run looks back."""
+        starts_ns = [d.t0_ns for i in self.imus if i.is_ready and (d := i.description()) is not None]
+        if not self._camera_problem:
+            starts_ns.append((self.ring.first_keyframe_us or 0) * 1000)
+        full_ns = max(starts_ns) + round(self._config.recording.pre_roll_s * 1e9)
+        while monotonic_ns() < full_ns:
+            self._beat()
+            time.sleep(_POLL_S)
+
+    # Watching
+
+    @property
+    def t0_ns(self) -> int | None:
+        """The first edge, once it has come."""
+        return None if self.trigger is None else self.trigger.t0_ns
+
+    @property
+    def has_sensors(self) -> bool:
+        """Whether anything still delivers."""
+        return not self._camera_problem or any(i.is_ready for i in self.imus)
+
+    @property
+    def window_ns(self) -> tuple[int, int]:
+        """First and last instant that the run shall hold; around the arming where no edge has come."""
+        t0_ns = self.t0_ns or self._t_armed_ns
+        r = self._config.recording
+        return (
+            t0_ns - round(r.pre_roll_s * 1e9),
+            t0_ns + round((self.duration_s + r.post_roll_s) * 1e9),
+        )
+
+    def poll(self) -> None:
+        """See how the sensors are, and note what was lost."""
+        for reader in self.imus:
+            reader.poll()
+            if reader.problem and reader.name not in self._imu_problems_told:
+                self._imu_problems_told.add(reader.name)
+                self._note_missing(f"imu {reader.name}: {reader.problem}{self._when()}")
+        if self._camera_section is None or self._camera_problem:
+            return
+        period_ns = self._camera_section.frame_duration_us * 1000
+        newest_us = self.ring.newest_us
+        silent_ns = monotonic_ns() - (newest_us or 0) * 1000
+        if silent_ns > max(_SILENT_CAMERA_NS, 10 * period_ns):
+            self._camera_problem = f"no picture for {silent_ns / 1e9:.1f} s"
+            self._note_missing(f"camera: {self._camera_problem}{self._when()}")
+
+    def note_trigger(self) -> None:
+        """Log the clocks at the first edge."""
+        self._trigger_triplet = read_clock_triplet()
+        self.log.add("first edge", t0_ns=self.t0_ns)
+
+    def is_over(self, now_ns: int) -> bool:
+        """Tell whether everything of the run's window has come in, or will not any more."""
+        end_ns = self.window_ns[1]
+        if now_ns < end_ns:
+            return False
+        if now_ns > end_ns + round(LATE_FRAMES_GRACE_S * 1e9):
+            return True
+        pictures_in = bool(self._camera_problem) or (self.ring.newest_us or 0) * 1000 >= end_ns
+        return pictures_in and all(i.has_slot_due_at(end_ns) for i in self.imus)
+
+    # Ending
+
+    def collect(self, *, interrupted: str = "") -> Recording:
+        """Cut the run out of what was recorded; ``interrupted`` says in words why it ends early."""
+        end_triplet = read_clock_triplet()
+        start_ns, end_ns = self.window_ns
+        until_ns = min(end_ns, end_triplet.monotonic_ns)
+        if interrupted:
+            self.missing.append(interrupted)
+            self.log.add("interrupted", words=interrupted)
+        if self.trigger is None:
+            raise HardwareError("there is no run to collect: the trigger was never watched")
+        edges = self.trigger.disarm()
+        self.missing += edges.problems
+        if edges.n_ignored:
+            self.log.add("edges before the first that counts", n=edges.n_ignored)
+        imus = []
+        for reader in self.imus:
+            description = reader.description()
+            if description is not None:
+                records = reader.records(start_ns, until_ns)
+                imus.append(ImuRecording(description, records, len(reader.slots_due(start_ns, until_ns))))
+        video = self._cut_video(start_ns, until_ns)
+        if video is not None:
+            self.missing += video.problems
+        self.log.add("collected", frames=len(video.records) if video else 0, edges=len(edges.edges_ns))
+        hardware = self._rig.describe() | {
+            f"sampler of imu {i.name}": i.scheduling for i in self.imus if i.scheduling
+        }
+        return Recording(
+            run_id=self.run_id,
+            unit=self._config.unit.name,
+            label=self.label,
+            state="interrupted" if interrupted else "complete",
+            simulated=self._rig.simulated,
+            hardware=hardware,
+            camera=self._camera_section,
+            video=video,
+            imus=imus,
+            trigger_pin=self.trigger.pin_name,
+            nominal_hz=self._config.trigger.nominal_hz,
+            edges=edges,
+            clocks=ClocksSection(arm=self._arm_triplet, trigger=self._trigger_triplet, end=end_triplet),
+            window_ns=(start_ns, end_ns),
+            missing=list(self.missing),
+            log=self.log,
+        )
+
+    def _cut_video(self, start_ns: int, end_ns: int) -> VideoCut | None:
+        section, first_us = self._camera_section, self.ring.first_abs_us
+        if section is None or first_us is None:
+            return None
+        packets, metadata = self.ring.snapshot()
+        return cut_video(
+            packets,
+            metadata,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            first_abs_us=first_us,
+            period_us=section.frame_duration_us,
+            default_exposure_us=section.exposure_us,
+            default_gain=section.analogue_gain,
+        )
+
+    def close(self) -> None:
+        """Let go of every sensor; what hangs is left behind. Calling it twice does no harm."""
+        if self.trigger is not None:
+            self.trigger.close()
+        camera, self._camera = self._camera, None
+        if camera is not None:
+            try:
+                self._in_time("stop", camera.stop, CAMERA_STOP_TIMEOUT_S, give_up=False)
+            except (BricktrackError, OSError) as e:
+                logger.warning("camera: %s", e)
+        for reader in self.imus:
+            reader.stop()
+
+    def _in_time(self, what: str, call: Callable[[], T], timeout_s: float, *, give_up: bool = True) -> T:
+        """Return what a camera's call returns; a call that hangs is left to its thread."""
+        results: list[T] = []
+        errors: list[BaseException] = []
+
+        def run() -> None:
+            try:
+                results.append(call())
+            except BaseException as e:  # noqa: BLE001 - raised again in the caller's thread
+                errors.append(e)
+
+        thread = threading.Thread(target=run, name=f"camera-{what}", daemon=True)
+        thread.start()
+        deadline = time.monotonic() + timeout_s
+        while thread.is_alive() and time.monotonic() < deadline:
+            if give_up:
+                self._beat()
+            thread.join(_POLL_S)
+        if errors:
+            raise errors[0]
+        if not results:
+            raise HardwareError(f"{what} hangs: no answer within {timeout_s:g} s. Restart bricktrackd")
+        return results[0]
+
+    def _note_missing(self, words: str) -> None:
+        logger.warning("%s: %s", self.run_id, words)
+        self.missing.append(words)
+        self.log.add("missing", words=words)
+
+    def _when(self) -> str:
+        return "" if self.t0_ns is None else f", {(monotonic_ns() - self.t0_ns) / 1e9:+.1f} s from t = 0"

@@ -1,0 +1,206 @@
+"""The square wave's edges, as stamped where they happened: the first one after arming is t = 0.
+
+gpiozero's ``when_activated`` hands on no stamp, so the pin-level hook is taken: it is called with the edge's
+time in seconds (the kernel's stamp under the lgpio factory) and the level. That hook holds a **weak**
+reference, hence the bound method of an object that the recorder keeps.
+"""
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gpiozero
+
+from bricktrack_common.clocks import monotonic_ns
+from bricktrack_common.errors import HardwareError
+from bricktrack_device.config import TriggerTable
+
+logger = logging.getLogger(__name__)
+
+MAX_EDGES = 5_000_000
+_MAX_STAMP_AGE_NS = 2_000_000_000
+_MAX_STAMP_AHEAD_NS = 5_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeTrain:
+    """What the trigger saw since arming.
+
+    Attributes
+    ----------
+    t0_ns : int or None
+        The first edge that counts.
+    edges_ns : list of int
+        That edge and every later rising one.
+    n_ignored : int
+        Rising edges before it that did not count: line not seen low, or no quiet gap.
+    problems : list of str
+    """
+
+    t0_ns: int | None
+    edges_ns: list[int]
+    n_ignored: int
+    problems: list[str]
+
+
+class Trigger:
+    """One input pin, watched from `arm` to `close`.
+
+    Parameters
+    ----------
+    factory : gpiozero.Factory
+        lgpio on a Pi; other real factories stamp late, in Python.
+    settings : TriggerTable
+    clock : callable
+        CLOCK_MONOTONIC, ns; stamps that are not on it are refused.
+    """
+
+    def __init__(
+        self,
+        factory: gpiozero.Factory,
+        settings: TriggerTable,
+        *,
+        clock: Callable[[], int] = monotonic_ns,
+    ) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._lock = threading.Lock()
+        # Apart from the other: closing may wait for a call of _on_change to end.
+        self._close_lock = threading.Lock()
+        self._on_first_edge: Callable[[], None] | None = None
+        self._armed_ns: int | None = None
+        self._low_since_ns: int | None = None
+        self._last_change_ns = 0
+        self._t0_ns: int | None = None
+        self._edges_ns: list[int] = []
+        self._n_ignored = 0
+        self._n_out_of_order = 0
+        self._n_off_clock = 0
+        self._worst_off_ns = 0
+        try:
+            pull_up, active = {"down": (False, None), "up": (True, None), "none": (None, True)}[settings.pull]
+            self._device = gpiozero.DigitalInputDevice(
+                settings.pin, pull_up=pull_up, active_state=active, bounce_time=None, pin_factory=factory
+            )
+        except (gpiozero.GPIOZeroError, OSError, ValueError) as e:
+            raise HardwareError(
+                f"trigger pin {settings.pin}: {e}. Check trigger.pin, and that no other program holds the pin"
+            ) from e
+        self._device.pin.when_changed = self._on_change
+
+    @property
+    def pin_name(self) -> str:
+        """The pin as gpiozero names it."""
+        return str(self._device.pin.info.name)
+
+    @property
+    def line_is_high(self) -> bool | None:
+        """The line's level now; `None` once closed."""
+        with self._close_lock:
+            return None if self._device.closed else bool(self._device.pin.state)
+
+    @property
+    def t0_ns(self) -> int | None:
+        """The first edge that counts, once it has come."""
+        return self._t0_ns
+
+    @property
+    def n_edges(self) -> int:
+        """Rising edges logged so far, the first included."""
+        return len(self._edges_ns)
+
+    def arm(self, on_first_edge: Callable[[], None]) -> int:
+        """Wait for the first edge from now on, and call ``on_first_edge`` from the pin's thread then.
+
+        Returns
+        -------
+        t_armed_ns : int
+        """
+        with self._lock:
+            now = self._clock()
+            self._on_first_edge = on_first_edge
+            self._armed_ns = now
+            self._last_change_ns = now
+            # Read after the clock: a line low here was low at or after arming.
+            self._low_since_ns = None if self.line_is_high else now
+            self._t0_ns = None
+            self._edges_ns = []
+            self._n_ignored = self._n_out_of_order = self._n_off_clock = self._worst_off_ns = 0
+            return now
+
+    def disarm(self) -> EdgeTrain:
+        """Stop logging and return what was seen."""
+        with self._lock:
+            train = self._train()
+            self._armed_ns = None
+            return train
+
+    def snapshot(self) -> EdgeTrain:
+        """Return what was seen so far."""
+        with self._lock:
+            return self._train()
+
+    def close(self) -> None:
+        """Give the pin back. Calling it twice does no harm."""
+        with self._close_lock:
+            self._device.close()
+
+    def _train(self) -> EdgeTrain:
+        problems = []
+        if self._n_out_of_order:
+            problems.append(
+                f"trigger: {self._n_out_of_order} edges were stamped before the one ahead; left out"
+            )
+        if self._n_off_clock:
+            problems.append(
+                f"trigger: {self._n_off_clock} edges have stamps up to {self._worst_off_ns / 1e9:.3f} s off "
+                "CLOCK_MONOTONIC and were left out; kernel 5.7 or newer and the lgpio factory are needed"
+            )
+        if len(self._edges_ns) >= MAX_EDGES:
+            problems.append(f"trigger: only the first {MAX_EDGES} edges were kept")
+        return EdgeTrain(self._t0_ns, list(self._edges_ns), self._n_ignored, problems)
+
+    def _on_change(self, ticks_s: float, state: int) -> None:
+        """Take one change of the line; called by gpiozero, in the pin's thread."""
+        t_ns = round(ticks_s * 1e9)
+        first_edge = None
+        with self._lock:
+            if self._armed_ns is None:
+                return
+            off_ns = self._clock() - t_ns
+            if not -_MAX_STAMP_AHEAD_NS <= off_ns <= _MAX_STAMP_AGE_NS:
+                self._n_off_clock += 1
+                self._worst_off_ns = max(self._worst_off_ns, abs(off_ns))
+                return
+            if state:
+                if self._take_rising(t_ns):
+                    first_edge = self._on_first_edge
+            elif self._low_since_ns is None and t_ns >= self._armed_ns:
+                self._low_since_ns = t_ns
+            self._last_change_ns = max(self._last_change_ns, t_ns)
+        if first_edge is not None:
+            first_edge()
+
+    def _take_rising(self, t_ns: int) -> bool:
+        """Log one rising edge; tell whether it is the first that counts."""
+        if self._t0_ns is not None:
+            if t_ns <= self._edges_ns[-1]:
+                self._n_out_of_order += 1
+            elif len(self._edges_ns) < MAX_EDGES:
+                self._edges_ns.append(t_ns)
+            return False
+        seen_low = self._low_since_ns is not None or not self._settings.require_low
+        quiet_ns = t_ns - self._last_change_ns
+        since = self._low_since_ns if self._low_since_ns is not None else self._armed_ns
+        if (
+            not seen_low
+            or since is None
+            or t_ns < since
+            or quiet_ns < round(self._settings.quiet_gap_ms * 1e6)
+        ):
+            self._n_ignored += 1
+            return False
+        self._t0_ns = t_ns
+        self._edges_ns.append(t_ns)
+        return True

@@ -1,0 +1,222 @@
+import queue
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from device_fakes import FakeBusOpener, FakeCamera, FakeRig
+
+from bricktrack_common.run_folder import read_run
+from bricktrack_common.wire_messages import Armed, Disarmed, Refusal, Reply
+from bricktrack_device.config import (
+    CameraTable,
+    DeviceConfig,
+    ImuTable,
+    RecordingTable,
+    StorageTable,
+    UnitTable,
+)
+from bricktrack_device.recorder import Recorder
+from bricktrack_device.run_store import Disk, RunStore
+
+
+def config_for(folder: Path, **changes: object) -> DeviceConfig:
+    config = DeviceConfig(
+        unit=UnitTable(name="unit-1"),
+        storage=StorageTable(folder=str(folder), margin_mb=1),
+        recording=RecordingTable(duration_s=0.5, pre_roll_s=0.2, post_roll_s=0.1),
+        imu=[],
+    )
+    return msgspec.structs.replace(config, **changes)
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "the condition was not met in time"
+        time.sleep(0.005)
+
+
+class Bench:
+    """A recorder on fakes, and what it answered."""
+
+    def __init__(self, config: DeviceConfig, rig: FakeRig, disk: Disk | None = None) -> None:
+        self.config = config
+        self.rig = rig
+        self.store = RunStore(config.storage_folder, config.unit.name, disk=disk)
+        self.recorder = Recorder(config, rig, self.store)
+        self.recorder.start()
+
+    def ask(self, what: str, *args: object, timeout_s: float = 20.0) -> Reply:
+        answers: queue.Queue[Reply] = queue.Queue()
+        getattr(self.recorder, what)(*args, answers.put)
+        return answers.get(timeout=timeout_s)
+
+    def arm(self, label: str = "", duration_s: float | None = None) -> Armed:
+        reply = self.ask("arm", label, duration_s)
+        assert isinstance(reply, Armed), reply
+        return reply
+
+    def wait_for(self, state: str) -> None:
+        wait_until(lambda: self.recorder.state == state)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
+    made: list[Bench] = []
+
+    def make(*, rig: FakeRig | None = None, disk: Disk | None = None, **changes: object) -> Bench:
+        made.append(Bench(config_for(tmp_path, **changes), rig or FakeRig(), disk))
+        return made[-1]
+
+    yield make
+    for b in made:
+        b.recorder.stop()
+
+
+def test_an_edge_makes_a_whole_run_around_it(bench: Callable[..., Bench], tmp_path: Path) -> None:
+    b = bench(imu=[ImuTable(name="brick", bus="a")])
+    armed = b.arm("shake")
+    assert b.recorder.state == "armed" and b.rig.armed_ns
+    b.rig.pulse(3)
+    b.wait_for("recording")
+    b.wait_for("idle")
+    run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
+    m = run.manifest
+    assert m.state == "complete" and m.missing == [] and run.problems == []
+    assert m.label == "shake" and m.simulated and m.run_id.endswith("_0001_shake")
+    t0 = m.trigger.t0_ns
+    assert t0 is not None and run.edges_ns.size == 3 and run.edges_ns[0] == t0
+    # The window is asked for in the configuration: 0.2 s before the edge, 0.5 + 0.1 s after it.
+    assert m.window_ns == (t0 - 200_000_000, t0 + 600_000_000)
+    assert run.frames is not None
+    stamps = run.frames.sensor_timestamp_ns
+    assert run.frames.keyframe[0] and stamps[0] <= m.window_ns[0] < stamps[6]
+    assert m.window_ns[1] - 34_000_000 < stamps[-1] <= m.window_ns[1]
+    assert np.all(np.abs(np.diff(stamps) - 33_327_000) < 1000)
+    assert m.quality.frames_dropped == 0 and m.quality.frames_without_metadata == 0
+    description, samples = run.imus["brick"]
+    assert description.chip_id == bytes(range(16)).hex() and description.acc_range_g == 16.0
+    assert m.window_ns[0] <= samples.t_ns[0] and samples.t_ns[-1] - m.window_ns[1] < 20_000_000
+    assert m.quality.imu_slots in (80, 81)
+    assert m.clocks.arm and m.clocks.trigger and m.clocks.end
+    assert m.file("truth.npz") is not None and m.file("log.jsonl") is not None
+
+
+def test_disarming_leaves_no_run(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.arm()
+    assert isinstance(b.ask("disarm"), Disarmed)
+    assert b.recorder.state == "idle" and b.store.list_runs() == []
+    assert b.rig.camera.n_stops == 1
+
+
+def test_a_second_arm_is_refused_and_names_the_state(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.arm()
+    reply = b.ask("arm", "", None)
+    assert isinstance(reply, Refusal) and reply.code == "wrong-state" and "armed" in reply.message
+
+
+def test_a_missing_imu_stops_neither_the_camera_nor_the_other(
+    bench: Callable[..., Bench], tmp_path: Path
+) -> None:
+    rig = FakeRig(buses={"dead": FakeBusOpener(present=False)})
+    b = bench(rig=rig, imu=[ImuTable(name="gone", bus="dead"), ImuTable(name="brick", bus="live")])
+    armed = b.arm()
+    assert len(armed.missing) == 1 and "imu gone" in armed.missing[0] and "0x28" in armed.missing[0]
+    rig.pulse()
+    b.wait_for("recording")
+    b.wait_for("idle")
+    run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
+    assert list(run.imus) == ["brick"] and run.frames is not None
+    assert any("imu gone" in words for words in run.manifest.missing)
+
+
+def test_a_sampler_that_dies_during_the_run_is_said_and_its_samples_kept(
+    bench: Callable[..., Bench], tmp_path: Path
+) -> None:
+    rig = FakeRig(buses={"a": FakeBusOpener(exit_after=60)})
+    b = bench(rig=rig, imu=[ImuTable(name="brick", bus="a")])
+    armed = b.arm()
+    rig.pulse()
+    b.wait_for("recording")
+    b.wait_for("idle")
+    run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
+    assert any("died (exit code 7)" in words for words in run.manifest.missing)
+    _, samples = run.imus["brick"]
+    assert 0 < samples.t_ns.size < 70 and run.manifest.quality.imu_gaps > 0
+
+
+def test_a_camera_that_does_not_start_refuses_arming_unless_not_required(
+    bench: Callable[..., Bench], tmp_path: Path
+) -> None:
+    b = bench(rig=FakeRig(camera=FakeCamera(fail="exposure wanders")))
+    reply = b.ask("arm", "", None)
+    assert isinstance(reply, Refusal) and reply.code == "not-ready" and "exposure wanders" in reply.message
+    assert b.recorder.state == "idle"
+
+
+def test_a_camera_that_is_not_required_may_be_missing(bench: Callable[..., Bench], tmp_path: Path) -> None:
+    b = bench(
+        rig=FakeRig(camera=FakeCamera(fail="no camera")),
+        camera=CameraTable(required=False),
+        imu=[ImuTable(name="brick", bus="a")],
+    )
+    armed = b.arm()
+    assert armed.missing == ["camera: no camera"]
+    b.rig.pulse()
+    b.wait_for("recording")
+    b.wait_for("idle")
+    run = read_run(tmp_path / "runs" / armed.run_id)
+    assert run.frames is None and run.video is None and run.imus and run.manifest.camera is None
+
+
+def test_a_camera_that_falls_silent_is_noticed_and_what_came_is_kept(
+    bench: Callable[..., Bench], tmp_path: Path
+) -> None:
+    b = bench(
+        rig=FakeRig(camera=FakeCamera(silent_after=20)),
+        recording=RecordingTable(duration_s=1.5, pre_roll_s=0.2, post_roll_s=0.1),
+    )
+    armed = b.arm()
+    b.rig.pulse()
+    b.wait_for("recording")
+    b.wait_for("idle")
+    run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
+    assert any("camera: no picture" in words for words in run.manifest.missing)
+    assert any("video: ends" in words for words in run.manifest.missing)
+    assert run.frames is not None and 0 < run.frames.n_frames <= 20
+
+
+def test_stopping_in_the_middle_saves_an_interrupted_run(bench: Callable[..., Bench], tmp_path: Path) -> None:
+    b = bench(recording=RecordingTable(duration_s=30.0, pre_roll_s=0.2, post_roll_s=0.1))
+    armed = b.arm()
+    b.rig.pulse()
+    b.wait_for("recording")
+    time.sleep(0.3)
+    b.recorder.stop()
+    run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
+    assert run.manifest.state == "interrupted"
+    assert any("the daemon was stopped" in words for words in run.manifest.missing)
+    assert run.frames is not None and run.frames.n_frames >= 10
+
+
+def test_too_little_space_refuses_arming_with_numbers(bench: Callable[..., Bench]) -> None:
+    b = bench(storage=StorageTable(folder="/dev/shm", margin_mb=10**9))
+    reply = b.ask("arm", "", None)
+    assert isinstance(reply, Refusal) and reply.code == "no-space" and "MB" in reply.message
+
+
+def test_the_unit_arms_itself_again_until_it_is_disarmed(bench: Callable[..., Bench]) -> None:
+    b = bench(recording=RecordingTable(duration_s=0.2, pre_roll_s=0.1, post_roll_s=0.0, auto_arm=True))
+    for n in (1, 2):
+        b.wait_for("armed")
+        b.rig.pulse()
+        wait_until(lambda n=n: b.store.count_runs() == n)
+    b.wait_for("armed")
+    assert isinstance(b.ask("disarm"), Disarmed)
+    time.sleep(0.5)
+    assert b.recorder.state == "idle"
