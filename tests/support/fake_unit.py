@@ -1,0 +1,141 @@
+"""A brick unit in a thread, serving run folders over the real protocol, and misbehaving when told to."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import zmq
+
+from bricktrack_common.checksums import crc32
+from bricktrack_common.clocks import read_clock_triplet
+from bricktrack_common.run_manifest import MANIFEST_NAME, file_entry, read_manifest
+from bricktrack_common.wire_messages import (
+    Arm,
+    Armed,
+    Chunk,
+    Confirm,
+    Confirmed,
+    DescribeRun,
+    Disarm,
+    Disarmed,
+    FileSummary,
+    GetStatus,
+    Hello,
+    HelloReply,
+    ListRuns,
+    Read,
+    Refusal,
+    RunDescription,
+    RunList,
+    RunSummary,
+    StatusReply,
+    decode_request,
+    encode_message,
+)
+
+Message = list[bytes]
+Misbehaviour = Callable[[object, list[Message]], list[Message]]
+"""Gets a request and the messages that would answer it; returns what is sent instead."""
+
+
+class FakeUnit:
+    """Serves every run folder below ``runs``; ``misbehave`` may alter each answer."""
+
+    def __init__(self, runs: Path, *, name: str = "fake", misbehave: Misbehaviour | None = None, port: int = 0) -> None:
+        self.name = name
+        self.runs = runs
+        self.misbehave = misbehave or (lambda request, messages: messages)
+        self.requests: list[object] = []
+        self.confirmed: set[str] = set()
+        self.state = "idle"
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self.port = port or self._socket.bind_to_random_port("tcp://127.0.0.1")
+        if port:
+            self._socket.bind(f"tcp://127.0.0.1:{port}")
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="fake-unit")
+
+    @property
+    def address(self) -> str:
+        return f"tcp://127.0.0.1:{self.port}"
+
+    def __enter__(self) -> "FakeUnit":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._socket.close()
+        self._context.term()
+
+    def reads(self) -> list[Read]:
+        return [r for r in self.requests if isinstance(r, Read)]
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            if not self._socket.poll(20):
+                continue
+            identity, header = self._socket.recv_multipart()
+            request_id, request = decode_request(header)
+            self.requests.append(request)
+            reply, data = self._answer(request)
+            message = [encode_message(request_id, reply), *data]
+            for altered in self.misbehave(request, [message]):
+                self._socket.send_multipart([identity, *altered])
+
+    def _answer(self, request: object) -> tuple[object, list[bytes]]:
+        match request:
+            case Hello():
+                return HelloReply(unit=self.name, software="fake", simulated=True), []
+            case GetStatus():
+                return self._status(), []
+            case Arm(label=label):
+                self.state = "armed"
+                return Armed(run_id=f"{self.name}_0001_{label}", missing=["imu base: no answer"]), []
+            case Disarm():
+                self.state = "idle"
+                return Disarmed(), []
+            case ListRuns():
+                return RunList(runs=[self._summary(f) for f in self._folders()]), []
+            case DescribeRun(run_id=run_id):
+                return RunDescription(run_id=run_id, files=self._files(run_id)), []
+            case Read():
+                path = self.runs / request.run_id / self._files(request.run_id)[request.file_index].name
+                data = path.read_bytes()[request.offset : request.offset + request.length]
+                return (
+                    Chunk(run_id=request.run_id, file_index=request.file_index, offset=request.offset,
+                          n_bytes=len(data), crc32=crc32(data)),
+                    [data],
+                )  # fmt: skip
+            case Confirm(run_id=run_id, sha256=sha256):
+                if sha256 != [f.sha256 for f in self._files(run_id)]:
+                    return Refusal(code="hash-mismatch", message="other hashes"), []
+                self.confirmed.add(run_id)
+                return Confirmed(run_id=run_id), []
+        raise AssertionError(request)
+
+    def _folders(self) -> list[Path]:
+        return sorted(p for p in self.runs.iterdir() if p.is_dir())
+
+    def _files(self, run_id: str) -> list[FileSummary]:
+        folder = self.runs / run_id
+        entries = [file_entry(folder / MANIFEST_NAME), *read_manifest(folder / MANIFEST_NAME).files]
+        return [FileSummary(name=e.name, n_bytes=e.n_bytes, sha256=e.sha256) for e in entries]
+
+    def _summary(self, folder: Path) -> RunSummary:
+        return RunSummary(
+            run_id=folder.name, state="complete", n_bytes=sum(f.n_bytes for f in self._files(folder.name)),
+            confirmed=folder.name in self.confirmed,
+        )  # fmt: skip
+
+    def _status(self) -> StatusReply:
+        return StatusReply(
+            unit=self.name, state=self.state, runs=len(self._folders()), disk_free_bytes=10**10,
+            disk_needed_bytes=10**8, frames=0, imus=[], edges=0, clocks=read_clock_triplet(),
+        )  # fmt: skip
