@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.camera_model import Projection, SensorMode
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.dot_observations import DotObservations
@@ -27,6 +27,7 @@ from bricktrack_host.pixel_polynomials import (
     as_points,
     in_chunks,
     least_squares,
+    left_out_errors,
     monomials,
     n_terms,
     newton_inverse,
@@ -227,7 +228,6 @@ def fit_central_rays(
     *,
     sensor_mode: SensorMode,
     order: int = DEFAULT_ORDER,
-    z0_start_mm: float | None = None,
 ) -> CentralRays:
     """Fit one slope polynomial and the projection centre to the dots of two or more planes.
 
@@ -237,8 +237,6 @@ def fit_central_rays(
         Depth z, mm, and the dots seen there.
     sensor_mode : SensorMode
     order : int, optional
-    z0_start_mm : float, optional, mm
-        First guess of the projection centre's depth; searched for where not given.
 
     Returns
     -------
@@ -249,18 +247,8 @@ def fit_central_rays(
     CalibrationError
         If the planes do not differ, the dots are too few for the order, or no projection centre is found.
     """
+    problem, solution = _solve(planes, sensor_mode, order)
     depths = [z for z, _ in planes]
-    if len(planes) < 2 or not 0 < min(depths) < max(depths):
-        raise CalibrationError(f"planes at z = {depths} mm: expected two or more different depths over 0")
-    problem = _Problem(planes, sensor_mode, order)
-    solution = problem.solve(problem.start_mm() if z0_start_mm is None else z0_start_mm)
-    # Where a plane scatters more (board print, light, distance), its dots weigh less in the second pass.
-    scatter = np.array(
-        [np.sqrt(np.mean(solution.residual_mm[problem.plane == k] ** 2)) for k in range(len(planes))]
-    )
-    scatter = np.maximum(scatter, max(scatter.max() / MAX_WEIGHT_RATIO, 1e-12))
-    problem.weight = (scatter.min() / scatter)[problem.plane]
-    solution = problem.solve(solution.z0_mm)
     return CentralRays(
         sensor_mode=sensor_mode,
         plane_a_mm=min(depths),
@@ -274,6 +262,48 @@ def fit_central_rays(
             residuals_of(solution.residual_mm[problem.plane == k], z_mm=depths[k]) for k in range(len(planes))
         ),
     )
+
+
+def _solve(
+    planes: Sequence[tuple[float, DotObservations]], sensor_mode: SensorMode, order: int
+) -> tuple[_Problem, _Solution]:
+    """Fit twice: with equal weights, then each plane weighted by its own scatter."""
+    depths = [z for z, _ in planes]
+    if len(planes) < 2 or not 0 < min(depths) < max(depths):
+        raise CalibrationError(f"planes at z = {depths} mm: expected two or more different depths over 0")
+    problem = _Problem(planes, sensor_mode, order)
+    solution = problem.solve(problem.start_mm())
+    # Where a plane scatters more (board print, light, distance), its dots weigh less in the second pass.
+    scatter = np.array(
+        [np.sqrt(np.mean(solution.residual_mm[problem.plane == k] ** 2)) for k in range(len(planes))]
+    )
+    scatter = np.maximum(scatter, max(scatter.max() / MAX_WEIGHT_RATIO, 1e-12))
+    problem.weight = (scatter.min() / scatter)[problem.plane]
+    solution = problem.solve(solution.z0_mm)
+    return problem, solution
+
+
+def left_out_errors_mm(
+    planes: Sequence[tuple[float, DotObservations]],
+    folds: Sequence[IntArray],
+    *,
+    sensor_mode: SensorMode,
+    order: int,
+) -> list[FloatArray]:
+    """Return, for each plane, the errors, shape (n, 2), mm, at dots left out of the fit fold by fold.
+
+    The depth of the projection centre and the planes' weights, a few numbers that all dots share, are those
+    of the fit to all.
+    """
+    problem, solution = _solve(planes, sensor_mode, order)
+    w = problem.weight[:, None]
+    errors = left_out_errors(
+        w * problem.design(solution.z0_mm),
+        w * problem.xy_mm,
+        np.concatenate(list(folds)),
+        what=f"central rays, order {order}",
+    )
+    return [(errors / w)[problem.plane == k] for k in range(len(planes))]
 
 
 def _covariance(problem: _Problem, solution: _Solution) -> FloatArray:

@@ -7,6 +7,7 @@ light does not pull the centre. It is the centroid of the *image* of the disc;
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import cv2
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.errors import CalibrationError, ShapeError
-from bricktrack_host.neighbours import Neighbours
+from bricktrack_host.neighbours import Neighbours, median_spacing
 
 GreyImage = NDArray[np.uint8]
 Polarity = Literal["auto", "white-on-black", "black-on-white"]
@@ -201,85 +202,129 @@ def _local_threshold(smooth: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[n
     return (low_map + high_map) / 2, contrast >= needed
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Patch:
+    """The surroundings of one dot: pixels of its window, and which belong to what."""
+
+    origin_px: tuple[int, int]  # column and row of the window's first pixel
+    light: FloatArray
+    disc: BoolArray  # the dot with its blurred rim
+    background_grey: float  # NaN where other dots leave none
+    plateau_grey: float
+    noise_grey: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moments:
+    """Light-weighted moments of one dot about a given point, and the blur of its rim."""
+
+    shift_px: FloatArray
+    cov_px2: FloatArray
+    area_px2: float
+    blur_px: float
+
+
 def _measure(light: NDArray[np.uint8], regions: _Regions, polarity: Polarity) -> Dots:
     """Return the light-weighted centroids of the regions."""
     n = len(regions.label)
     rows, columns = light.shape
-    levels = np.full((n, 2), np.nan)  # background, plateau
-    centre = np.empty((n, 2))
-    radius = np.sqrt(regions.area_px2 / np.pi)
-    windows: list[tuple[slice, slice]] = []
-    inside: list[BoolArray] = []
-    noise = np.full(n, np.nan)
-    to_border = np.empty(n)
-    disc = [cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * k + 1, 2 * k + 1)) for k in range(1, 64)]
-    for i in range(n):
-        left, top, width, height = (int(x) for x in regions.box[i])
-        # The blurred rim of the dot lies within `reach` of its half-level outline, the background beyond.
-        reach = int(np.clip(round(0.35 * radius[i]), 3, 30))
-        margin = reach + max(2, reach // 2)
-        to_border[i] = min(left, top, columns - left - width, rows - top - height)
-        window = (
-            slice(max(top - margin, 0), min(top + height + margin, rows)),
-            slice(max(left - margin, 0), min(left + width + margin, columns)),
-        )
-        own = (regions.labels[window] == regions.label[i]).astype(np.uint8)
-        others = ((regions.labels[window] > 0) & (own == 0)).astype(np.uint8)
-        wide = cv2.dilate(own, disc[reach - 1]) > 0
-        around = (cv2.dilate(own, disc[margin - 1]) > 0) & ~wide
-        around &= cv2.dilate(others, disc[reach - 1]) == 0
-        core = cv2.erode(own, disc[min(reach, max(1, int(radius[i] / 2))) - 1], borderValue=0) > 0
-        if not core.any():
-            core = own > 0
-        patch = light[window].astype(np.float64)
-        if np.count_nonzero(around) >= 8:
-            levels[i, 0] = patch[around].mean()
-            noise[i] = patch[around].std()
-        levels[i, 1] = patch[core].mean()
-        vv, uu = np.nonzero(own)
-        centre[i] = uu.mean() + window[1].start, vv.mean() + window[0].start
-        windows.append(window)
-        inside.append(wide)
+    left, top, width, height = regions.box.T
+    middle = np.stack([left + (width - 1) / 2, top + (height - 1) / 2], axis=1)
+    to_border = np.minimum.reduce([left, top, columns - left - width, rows - top - height])
+    radius = float(np.sqrt(np.median(regions.area_px2) / np.pi))
+    gap = (median_spacing(middle) if n > 1 else 4 * radius) - 2 * radius
+    widest = max(2, int(0.35 * gap))
+
+    # The rim reaches as far as the blur; how far that is, some of the dots tell.
+    whole = np.flatnonzero(to_border > 0)
+    some = [int(i) for i in whole[:: max(1, len(whole) // 50)]]
+    blur = np.nanmedian(
+        [_moments(_patch(light, regions, i, widest), middle[i]).blur_px for i in some] or [1.0]
+    )
+    reach = int(np.clip(np.ceil(2.5 * blur), 2, widest))
+
+    patches = [_patch(light, regions, i, reach) for i in range(n)]
+    levels = np.array([[p.background_grey, p.plateau_grey] for p in patches])
     known = np.isfinite(levels[:, 0])
     if not known.any():
         raise CalibrationError(
-            "no dot has free background around it: the dots touch each other; use a smaller dot or focus"
+            "no dot has free background around it: the dots touch each other; use smaller dots or focus"
         )
-    fallback = Neighbours(centre[known]).nearest(centre, 1)[1][:, 0]
-    levels[~known, 0] = levels[known, 0][fallback[~known]]
-    noise[~known] = noise[known][fallback[~known]]
+    nearest_known = np.flatnonzero(known)[Neighbours(middle[known]).nearest(middle, 1)[1][:, 0]]
+    levels[:, 0] = levels[nearest_known, 0]
     # The light of a cut dot is no guide to its neighbours': its plateau may be nothing but rim.
-    slopes = _level_slopes(centre, levels, trusted=to_border > 0)
-
-    uv = np.empty((n, 2))
-    cov = np.empty((n, 2, 2))
-    area = np.empty(n)
-    blur = np.full(n, np.nan)
-    for i in range(n):
-        window, use = windows[i], inside[i]
-        v, u = np.nonzero(use)
-        du = u + window[1].start - centre[i, 0]
-        dv = v + window[0].start - centre[i, 1]
-        dark = levels[i, 0] + slopes[i, 0, 0] * du + slopes[i, 0, 1] * dv
-        bright = levels[i, 1] + slopes[i, 1, 0] * du + slopes[i, 1, 1] * dv
-        step = np.maximum(bright - dark, MIN_CONTRAST_GREY / 2)
-        weight = (light[window][use] - dark) / step
-        total = float(weight.sum())
-        if total <= 0:
-            uv[i], cov[i], area[i] = np.nan, np.nan, 0.0
-            continue
-        shift_u, shift_v = float(weight @ du) / total, float(weight @ dv) / total
-        uv[i] = centre[i, 0] + shift_u, centre[i, 1] + shift_v
-        area[i] = total
-        lever = np.stack([du - shift_u, dv - shift_v]) * (max(noise[i], 0.5) / step)
-        cov[i] = lever @ lever.T / total**2
-        # Across an edge blurred by a Gaussian, weight (1 - weight) integrates to sigma / sqrt(pi).
-        blur[i] = float((weight * (1 - weight)).sum()) / (2 * np.sqrt(np.pi * total)) * np.sqrt(np.pi)
+    slopes = _level_slopes(middle, levels, trusted=to_border > 0)
+    moments = [_moments(p, m, lv, sl) for p, m, lv, sl in zip(patches, middle, levels, slopes, strict=True)]
+    uv = middle + np.array([m.shift_px for m in moments])
+    area = np.array([m.area_px2 for m in moments])
     good = (area > MIN_AREA_PX2) & np.all(np.isfinite(uv), axis=1)
     good &= (levels[:, 1] - levels[:, 0]) >= MIN_CONTRAST_GREY
     # With the rim cut at two sigma the centroid moves by some thousandths of a pixel only.
-    touches = to_border < np.ceil(2 * np.nanmedian(blur))
+    touches = to_border < np.ceil(2 * blur)
+    cov = np.array([m.cov_px2 for m in moments])
     return Dots(uv[good], cov[good], area[good], touches[good], polarity)
+
+
+def _patch(light: NDArray[np.uint8], regions: _Regions, i: int, reach: int) -> _Patch:
+    """Cut out a region with its rim of ``reach`` pixels and the background beyond."""
+    rows, columns = light.shape
+    left, top, width, height = (int(x) for x in regions.box[i])
+    margin = reach + max(2, reach // 2)
+    window = (
+        slice(max(top - margin, 0), min(top + height + margin, rows)),
+        slice(max(left - margin, 0), min(left + width + margin, columns)),
+    )
+    own = (regions.labels[window] == regions.label[i]).astype(np.uint8)
+    others = ((regions.labels[window] > 0) & (own == 0)).astype(np.uint8)
+    disc = cv2.dilate(own, _ellipse(reach)) > 0
+    around = (cv2.dilate(own, _ellipse(margin)) > 0) & ~disc & (cv2.dilate(others, _ellipse(reach)) == 0)
+    radius = float(np.sqrt(regions.area_px2[i] / np.pi))
+    core = cv2.erode(own, _ellipse(min(reach, max(1, int(radius / 2)))), borderValue=0) > 0
+    if not core.any():
+        core = own > 0
+    patch = light[window].astype(np.float64)
+    free = np.count_nonzero(around) >= 8
+    return _Patch(
+        origin_px=(window[1].start, window[0].start),
+        light=patch,
+        disc=np.asarray(disc),
+        background_grey=float(patch[around].mean()) if free else np.nan,
+        plateau_grey=float(patch[core].mean()),
+        noise_grey=float(patch[around].std()) if free else float(patch[core].std()),
+    )
+
+
+@lru_cache(maxsize=128)
+def _ellipse(radius: int) -> NDArray[np.uint8]:
+    """Return a disc as structuring element."""
+    size = 2 * radius + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), dtype=np.uint8)
+
+
+def _moments(
+    patch: _Patch, about_px: FloatArray, levels: FloatArray | None = None, slopes: FloatArray | None = None
+) -> _Moments:
+    """Return the moments of the light between background (0) and plateau (1), about a point.
+
+    ``levels`` are background and plateau there, ``slopes`` their gradients (level, axis) in grey/px; the
+    patch's own and none where not given.
+    """
+    background, plateau = (patch.background_grey, patch.plateau_grey) if levels is None else levels
+    tilt = np.zeros((2, 2)) if slopes is None else slopes
+    v, u = np.nonzero(patch.disc)
+    d_uv = np.stack([u + patch.origin_px[0] - about_px[0], v + patch.origin_px[1] - about_px[1]])
+    dark = background + tilt[0] @ d_uv
+    step = np.maximum(plateau + tilt[1] @ d_uv - dark, MIN_CONTRAST_GREY / 2)
+    weight = (patch.light[patch.disc] - dark) / step
+    total = float(weight.sum())
+    if not total > 0:
+        return _Moments(np.full(2, np.nan), np.full((2, 2), np.nan), 0.0, np.nan)
+    shift = d_uv @ weight / total
+    # Rounding to whole grey levels alone makes a noise of 0.29.
+    lever = (d_uv - shift[:, None]) * (max(patch.noise_grey, 0.29) / step)
+    # Across an edge blurred by a Gaussian, weight (1 - weight) integrates to sigma / sqrt(pi).
+    blur = float((weight * (1 - weight)).sum()) * np.sqrt(np.pi) / (2 * np.sqrt(np.pi * total))
+    return _Moments(shift, lever @ lever.T / total**2, total, blur)
 
 
 def _level_slopes(centre: FloatArray, levels: FloatArray, *, trusted: BoolArray) -> FloatArray:

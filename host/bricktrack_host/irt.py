@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.camera_model import Projection, SensorMode
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.dot_observations import DotObservations
@@ -26,6 +26,7 @@ from bricktrack_host.pixel_polynomials import (
     as_points,
     in_chunks,
     least_squares,
+    left_out_errors,
     monomials,
     newton_inverse,
     picture_grid,
@@ -227,3 +228,11 @@ def fit_two_plane_irt(
         region_b=ConvexRegion.around(plane_b.uv_px),
         residuals=tuple(residuals),
     )
+
+
+def left_out_errors_mm(
+    dots: DotObservations, fold: IntArray, *, sensor_mode: SensorMode, order: int
+) -> FloatArray:
+    """Return the errors, shape (n, 2), mm, at the dots of one plane left out of its fit fold by fold."""
+    design = monomials(PixelScaling.of_mode(sensor_mode).scaled(dots.uv_px), order).T
+    return left_out_errors(design, dots.xy_mm, fold, what=f"two-plane, order {order}")

@@ -14,7 +14,7 @@ from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
 
-CHUNK_POINTS = 4096
+CHUNK_POINTS = 1024
 """Points evaluated at once: their monomials fit into a core's second-level cache."""
 PICTURE_MARGIN = 0.1
 """Scaled pixels beyond the border up to which a projection is given: 96 px of 1920."""
@@ -159,6 +159,32 @@ def least_squares(design: FloatArray, targets: FloatArray, *, what: str) -> tupl
         )
     r_inverse = np.linalg.solve(r, np.eye(n_columns)) / scale[:, None]
     return r_inverse @ (q.T @ targets), r_inverse @ r_inverse.T
+
+
+def left_out_errors(design: FloatArray, targets: FloatArray, fold: IntArray, *, what: str) -> FloatArray:
+    """Return the errors, shape (n, n_targets), at each datum of a linear fit without the datum's fold.
+
+    Exact, from one factorisation: with H the projection onto the design's columns and S a fold, the errors
+    are ``(I - H_SS)^-1`` times the residuals of the fit to all.
+
+    Raises
+    ------
+    CalibrationError
+        If a fold left out leaves some coefficient undetermined.
+    """
+    q, _ = np.linalg.qr(design)
+    residual = q @ (q.T @ targets) - targets
+    errors = np.empty_like(residual)
+    for k in np.unique(fold):
+        own = fold == k
+        rest = np.eye(int(np.count_nonzero(own))) - q[own] @ q[own].T
+        try:
+            errors[own] = np.linalg.solve(rest, residual[own])
+        except np.linalg.LinAlgError as e:
+            raise CalibrationError(
+                f"{what}: too few dots to leave some out; take a lower order or more dots"
+            ) from e
+    return errors
 
 
 Which = slice | IntArray

@@ -16,6 +16,7 @@ from scipy.stats import f as f_distribution
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
+from bricktrack_host import central_rays, irt
 from bricktrack_host.central_rays import CentralRays, fit_central_rays
 from bricktrack_host.disc_bias import disc_bias_px, disc_diameter_mm
 from bricktrack_host.dot_observations import DotObservations
@@ -303,31 +304,23 @@ def cross_validate(
     The blocks are squares of the picture, common to all planes: what one plane loses is not handed over by
     another.
     """
-    fold = [_folds(dots.uv_px, median_spacing(planes[0][1].uv_px)) for _, dots in planes]
-    z0: float | None = None
+    spacing_px = median_spacing(planes[0][1].uv_px)
+    folds = [_folds(dots.uv_px, spacing_px) for _, dots in planes]
     if kind == "central":
-        z0 = float(fit_central_rays(planes, sensor_mode=sensor_mode, order=order).centre_mm[2])
-    distance_um = []
-    for k in range(N_FOLDS):
-        fitted = _fit(
-            [(z, dots.select(f != k)) for (z, dots), f in zip(planes, fold, strict=True)],
-            kind,
-            order,
-            sensor_mode,
-            z0_start_mm=z0,
-        )
+        errors = central_rays.left_out_errors_mm(planes, folds, sensor_mode=sensor_mode, order=order)
+    else:
         errors = [
-            fitted.points_on_plane(dots.uv_px[f == k], z) - dots.xy_mm[f == k]
-            for (z, dots), f in zip(planes, fold, strict=True)
+            irt.left_out_errors_mm(dots, fold, sensor_mode=sensor_mode, order=order)
+            for (_, dots), fold in zip(planes, folds, strict=True)
         ]
-        distance_um.append(1e3 * np.hypot(*np.concatenate(errors).T))
-    everywhere = np.concatenate(distance_um)
+    distance_um = 1e3 * np.hypot(*np.concatenate(errors).T)
+    fold = np.concatenate(folds)
     return CrossValidatedError(
         model=kind,
         order=order,
-        rms_um=float(np.sqrt(np.mean(everywhere**2))),
-        max_um=float(everywhere.max()),
-        fold_rms_um=tuple(float(np.sqrt(np.mean(d**2))) if len(d) else 0.0 for d in distance_um),
+        rms_um=float(np.sqrt(np.mean(distance_um**2))),
+        max_um=float(distance_um.max()),
+        fold_rms_um=tuple(float(np.sqrt(np.mean(distance_um[fold == k] ** 2))) for k in np.unique(fold)),
     )
 
 
@@ -344,11 +337,9 @@ def _simplest_of_the_best(candidates: Sequence[CrossValidatedError]) -> CrossVal
     return best
 
 
-def _fit(
-    planes: Planes, kind: ModelKind, order: int, mode: SensorMode, *, z0_start_mm: float | None = None
-) -> CentralRays | TwoPlaneIrt:
+def _fit(planes: Planes, kind: ModelKind, order: int, mode: SensorMode) -> CentralRays | TwoPlaneIrt:
     if kind == "central":
-        return fit_central_rays(planes, sensor_mode=mode, order=order, z0_start_mm=z0_start_mm)
+        return fit_central_rays(planes, sensor_mode=mode, order=order)
     if len(planes) != 2:
         raise CalibrationError(f"{len(planes)} planes given; the two-plane model takes two")
     (a_mm, dots_a), (b_mm, dots_b) = planes
