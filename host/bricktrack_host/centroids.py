@@ -28,6 +28,7 @@ FLOOR_SD_PX = 0.06
 """Precision of dot centres on real photographs by a Pi camera (DESIGN 7.1): lens, mosaic and codec, which the
 pixels' own noise does not show."""
 _NOISE_CODES = 2.0  # shot, read-out and codec noise at the rim, in grey levels of 8 bits
+_OWN = 128
 _MIN_CONTRAST = 0.02  # of full linear scale; less is noise or compression, not a lamp
 
 
@@ -85,7 +86,7 @@ def light_levels(patch: Plane) -> tuple[float, float] | None:
     The two classes are separated by their means (Ridler and Calvard), from the histogram; the levels are the
     medians of the classes, which neither a reflection nor the rim moves.
     """
-    counts = np.bincount(patch.ravel(), minlength=256).astype(np.float64)
+    counts = np.bincount(patch[::2, ::2].ravel(), minlength=256).astype(np.float64)
     light = _linear_light()
     cum_n = np.cumsum(counts)
     cum_light = np.cumsum(counts * light)
@@ -144,28 +145,22 @@ def measure_spot(
     rows, columns = patch.shape
     cut = int(np.searchsorted(share, SEARCH_SHARE))
     mask = cv2.threshold(patch, max(cut - 1, 0), 255, cv2.THRESH_BINARY)[1]
-    n, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
-    if n < 2:
-        return None
     u0, v0 = near_px if near_px is not None else (origin_px[0] + columns / 2, origin_px[1] + rows / 2)
-    target = np.array([u0 - origin_px[0], v0 - origin_px[1]])
-    areas = stats[1:, cv2.CC_STAT_AREA]
-    distances = np.hypot(*(centres[1:] - target).T) - np.sqrt(areas / np.pi)
-    distances[areas < 0.05 * areas.max()] += rows + columns  # specks do not win over the light itself
-    pick = 1 + int(np.argmin(distances))
-    x, y, w, h = (int(s) for s in stats[pick, : cv2.CC_STAT_AREA])
+    seed = _lit_pixel(mask, u0 - origin_px[0], v0 - origin_px[1])
+    if seed is None:
+        return None
+    _, mask, _, (x, y, w, h) = cv2.floodFill(mask, None, seed, _OWN, flags=8)
     touches = x == 0 or y == 0 or x + w == columns or y + h == rows
     # The soft rim reaches beyond the half-light line; three pixels hold it, and more where motion smears it.
     reach = 3 + max(w, h) // 12
     x0, y0 = max(x - reach, 0), max(y - reach, 0)
     box = (slice(y0, y + h + reach), slice(x0, x + w + reach))
-    labels = labels[box]
-    is_own = labels == pick
-    own = cv2.dilate(is_own.astype(np.uint8), _square(reach))
-    if n > 2:
-        others = (labels != 0) & ~is_own
-        if others.any():
-            own[(cv2.dilate(others.astype(np.uint8), _square(reach)) > 0) & ~is_own] = 0
+    mask = mask[box]
+    is_own = mask == _OWN
+    own = cv2.dilate(is_own.view(np.uint8), _square(reach))
+    others = mask == 255
+    if others.any():
+        own[(cv2.dilate(others.view(np.uint8), _square(reach)) > 0) & ~is_own] = 0
     table = np.clip((share - SHARE_LOW) / (SHARE_HIGH - SHARE_LOW), 0.0, 1.0)
     weights = cv2.LUT(patch[box], table.astype(np.float32)) * own
     m: dict[str, Any] = cv2.moments(weights)
@@ -196,6 +191,22 @@ def measure_spot(
         bbox=(origin_px[0] + x, origin_px[1] + y, w, h),
         touches_window=touches,
     )
+
+
+def _lit_pixel(mask: Plane, u: float, v: float) -> tuple[int, int] | None:
+    """Return a pixel of the light nearest to a point: of the component, not of a speck beside it."""
+    rows, columns = mask.shape
+    i, j = int(np.clip(round(u), 0, columns - 1)), int(np.clip(round(v), 0, rows - 1))
+    if mask[j, i] and mask[max(j - 1, 0) : j + 2, max(i - 1, 0) : i + 2].all():
+        return i, j
+    n, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
+    if n < 2:
+        return None
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    distances = np.hypot(centres[1:, 0] - u, centres[1:, 1] - v) - np.sqrt(areas / np.pi)
+    distances[areas < 0.05 * areas.max()] += rows + columns
+    y, x = np.nonzero(labels == 1 + int(np.argmin(distances)))
+    return int(x[0]), int(y[0])
 
 
 @cache

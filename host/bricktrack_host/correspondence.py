@@ -15,12 +15,12 @@ from itertools import combinations, permutations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.p3p import ray_centre_mm, rays_of, solve_p3p
-from bricktrack_host.prsoi import prsoi_poses
+from bricktrack_host.prsoi import PrsoiForm, prsoi_poses
 from bricktrack_host.refine import RefinedPoses, refine_poses
 from bricktrack_host.segment import Blobs
 
@@ -171,7 +171,7 @@ def paper_correspondence(points_mm: FloatArray, *, angle_limit_deg: float = 1.0)
 def paper_hypotheses(blobs: Blobs, ray_model: RayModel) -> IntArray:
     """Return what the paper's rules make of every choice of seven blobs, shape (n, 7); see `verify`.
 
-    The paper's filter lets a few reflections pass; its rules want seven points. More than ten blobs give none.
+    The paper's filter lets a few reflections pass; its rules want seven points. More than ten blobs: none.
     """
     if not 7 <= len(blobs) <= 10:
         return np.empty((0, 7), dtype=np.int64)
@@ -196,23 +196,20 @@ def _bend_deg(points: FloatArray) -> float:
 
 
 def verify(
-    blobs: Blobs,
-    hypotheses: IntArray,
+    uv_px: FloatArray,
     starts: tuple[FloatArray, FloatArray] | None,
     ray_model: RayModel,
     brick_model: BrickModel,
     *,
     collar_mm: float | None,
     gate_px: float,
-    max_steps: int = 6,
-) -> tuple[IntArray, RefinedPoses]:
+) -> tuple[BoolArray, RefinedPoses]:
     """Fit poses to assignments and keep the LEDs that each pose explains.
 
     Parameters
     ----------
-    blobs : Blobs
-    hypotheses : ndarray of int64, shape (n, n_leds)
-        Blob of each LED, -1 for none.
+    uv_px : ndarray, shape (n, n_leds, 2), px
+        The blob of each LED under each hypothesis; NaN for none.
     starts : (R, t) or None
         Shapes (n, 3, 3) and (n, 3); `None`: by PRSOI.
     gate_px : float
@@ -220,90 +217,60 @@ def verify(
 
     Returns
     -------
-    blob_of_led : ndarray of int64, shape (n, n_leds)
-        All -1 where fewer than four LEDs remain.
+    kept : ndarray of bool, shape (n, n_leds)
+        All false where fewer than four LEDs remain.
     poses : RefinedPoses
     """
-    kept = hypotheses.copy()
-    n = len(kept)
-    R, t = starts if starts is not None else _prsoi_starts(blobs, kept, ray_model, brick_model)
+    uv = uv_px.copy()
+    n = len(uv)
+    R, t = starts if starts is not None else prsoi_starts(uv, ray_model, brick_model)
     cov = np.broadcast_to(_IDENTITY_SD_PX**2 * np.eye(2), (n, brick_model.n_leds, 2, 2))
-    for _ in range(3):
-        uv = _pixels(blobs, kept)
-        poses = refine_poses(uv, cov, R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=max_steps)
+    poses = refine_poses(uv, cov, R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=6)
+    for last in (False, False, True):
         length = np.linalg.norm(poses.residual_px, axis=-1)
-        bad = (kept >= 0) & ~((length <= gate_px) & (poses.facing > _MIN_FACING))
-        # One at a time, the worst: a false blob drags its neighbours' residuals with it.
-        worst = np.where(bad, np.nan_to_num(length, nan=np.inf), -1.0)
-        drop = worst.max(axis=1) > 0
-        if not drop.any():
+        seen = np.isfinite(uv).all(axis=-1)
+        bad = seen & ~((length <= gate_px) & (poses.facing > _MIN_FACING))
+        rows = np.flatnonzero(bad.any(axis=1))
+        if rows.size == 0:
             break
-        rows = np.flatnonzero(drop)
-        kept[rows, worst[rows].argmax(axis=1)] = -1
-        R, t = (
-            np.where(np.isfinite(poses.R_camera_brick), poses.R_camera_brick, R),
-            np.where(np.isfinite(poses.t_camera_brick_mm), poses.t_camera_brick_mm, t),
+        if last:
+            uv[rows] = np.nan
+            break
+        # One at a time, the worst: a false blob drags its neighbours' residuals with it.
+        worst = np.where(bad[rows], np.nan_to_num(length[rows], nan=np.inf), -1.0)
+        uv[rows, worst.argmax(axis=1)] = np.nan
+        again = refine_poses(
+            uv[rows],
+            cov[rows],
+            np.where(np.isfinite(poses.R_camera_brick[rows]), poses.R_camera_brick[rows], R[rows]),
+            np.where(np.isfinite(poses.t_camera_brick_mm[rows]), poses.t_camera_brick_mm[rows], t[rows]),
+            ray_model,
+            brick_model,
+            collar_mm=collar_mm,
+            max_steps=6,
         )
-    else:
-        poses = refine_poses(
-            _pixels(blobs, kept), cov, R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=max_steps
-        )
-        length = np.linalg.norm(poses.residual_px, axis=-1)
-        bad = (kept >= 0) & ~((length <= gate_px) & (poses.facing > _MIN_FACING))
-        kept[bad.any(axis=1)] = -1
-    kept[(kept >= 0).sum(axis=1) < MIN_INLIERS] = -1
+        poses = poses.replaced(rows, again)
+    kept = np.isfinite(uv).all(axis=-1)
+    kept[kept.sum(axis=1) < MIN_INLIERS] = False
     return kept, poses
 
 
-def _pixels(blobs: Blobs, blob_of_led: IntArray) -> FloatArray:
+def blob_pixels(blobs: Blobs, blob_of_led: IntArray) -> FloatArray:
+    """Return the blobs' centroids in the order of the LEDs, shape (..., n_leds, 2), NaN for none."""
     return np.where((blob_of_led >= 0)[..., None], blobs.uv_px[np.maximum(blob_of_led, 0)], np.nan)
 
 
-def _prsoi_starts(
-    blobs: Blobs, hypotheses: IntArray, ray_model: RayModel, brick_model: BrickModel
+def prsoi_starts(
+    uv_px: FloatArray, ray_model: RayModel, brick_model: BrickModel, form: PrsoiForm = "safe"
 ) -> tuple[FloatArray, FloatArray]:
+    """Return the PRSOI poses, (n, 3, 3) and (n, 3), of centroids (n, n_leds, 2), NaN where unseen."""
     a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
-    on_a, on_b = ray_model.points_on_plane(blobs.uv_px, a), ray_model.points_on_plane(blobs.uv_px, b)
-    absent = (hypotheses < 0)[..., None]
-    index = np.maximum(hypotheses, 0)
-    found = prsoi_poses(
-        np.where(absent, np.nan, on_a[index]),
-        np.where(absent, np.nan, on_b[index]),
-        brick_model.led_positions_mm,
-        plane_a_mm=a,
-        plane_b_mm=b,
-    )
+    on_a, on_b = np.full_like(uv_px, np.nan), np.full_like(uv_px, np.nan)
+    seen = np.isfinite(uv_px).all(axis=-1)
+    on_a[seen] = ray_model.points_on_plane(uv_px[seen], a)
+    on_b[seen] = ray_model.points_on_plane(uv_px[seen], b)
+    found = prsoi_poses(on_a, on_b, brick_model.led_positions_mm, plane_a_mm=a, plane_b_mm=b, form=form)
     return found.R_camera_brick, found.t_camera_brick_mm
-
-
-def correspondence_from(
-    blobs: Blobs,
-    hypothesis: IntArray,
-    start: tuple[FloatArray, FloatArray] | None,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    *,
-    collar_mm: float | None,
-    gate_px: float,
-    max_steps: int = 6,
-) -> Correspondence:
-    """Return one hypothesis, verified; see `verify`."""
-    if (hypothesis >= 0).sum() < MIN_INLIERS:
-        return no_correspondence(brick_model.n_leds, "fewer than four LEDs have a blob")
-    starts = None if start is None else (start[0][None], start[1][None])
-    kept, poses = verify(
-        blobs,
-        hypothesis[None],
-        starts,
-        ray_model,
-        brick_model,
-        collar_mm=collar_mm,
-        gate_px=gate_px,
-        max_steps=max_steps,
-    )
-    if (kept[0] < 0).all():
-        return no_correspondence(brick_model.n_leds, "no pose explains the blobs")
-    return _answer(kept[0], poses, 0)
 
 
 def _answer(blob_of_led: IntArray, poses: RefinedPoses, i: int) -> Correspondence:
@@ -316,6 +283,25 @@ def _answer(blob_of_led: IntArray, poses: RefinedPoses, i: int) -> Correspondenc
         is_ambiguous=False,
         reason="",
     )
+
+
+def identify_by_paper(
+    blobs: Blobs, ray_model: RayModel, brick_model: BrickModel, *, collar_mm: float | None, gate_px: float
+) -> Correspondence:
+    """Identify seven LEDs by the paper's rules and verify by reprojection."""
+    if not is_paper_layout(brick_model):
+        return no_correspondence(brick_model.n_leds, "not the paper's layout")
+    hypotheses = paper_hypotheses(blobs, ray_model)
+    if len(hypotheses) == 0:
+        return no_correspondence(brick_model.n_leds, "no seven blobs obey the paper's rules")
+    kept, poses = verify(
+        blob_pixels(blobs, hypotheses), None, ray_model, brick_model, collar_mm=collar_mm, gate_px=gate_px
+    )
+    whole = np.flatnonzero(kept.all(axis=1))
+    if len(whole) == 0:
+        return no_correspondence(brick_model.n_leds, "reprojection refutes the paper's rules")
+    best = int(whole[np.argmin(poses.chi2[whole])])
+    return _answer(hypotheses[best], poses, best)
 
 
 def search_correspondence(
@@ -353,9 +339,10 @@ def search_correspondence(
         return no_correspondence(n_leds, "no pose brings four LEDs onto blobs")
     gate_px = identity_gate_px(geometry.radius_px)
     starts = (R, t + geometry.centre_mm)
-    kept, poses = verify(
-        blobs, hypotheses, starts, ray_model, brick_model, collar_mm=collar_mm, gate_px=gate_px
+    explained, poses = verify(
+        blob_pixels(blobs, hypotheses), starts, ray_model, brick_model, collar_mm=collar_mm, gate_px=gate_px
     )
+    kept = np.where(explained, hypotheses, -1)
     n_kept = (kept >= 0).sum(axis=1)
     if n_kept.max(initial=0) < MIN_INLIERS:
         return no_correspondence(n_leds, "no pose explains four LEDs within the gate")
@@ -472,7 +459,7 @@ def _hypotheses(geometry: _Geometry, brick_model: BrickModel) -> tuple[FloatArra
 def _score(
     R: FloatArray, t: FloatArray, geometry: _Geometry, brick_model: BrickModel, *, keep: int = 80
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the hypotheses that bring most LEDs onto blobs, one pose for each assignment, at most ``keep``."""
+    """Return the hypotheses that bring most LEDs onto blobs, best first, at most ``keep``."""
     n_leds = brick_model.n_leds
     gate = 0.8 * geometry.radius_px / geometry.px_per_slope
     blob_of_led = np.empty((len(R), n_leds), dtype=np.int64)

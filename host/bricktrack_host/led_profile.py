@@ -1,14 +1,14 @@
 """What a dome LED shows: where the centroid of its lit area falls, for a given pose.
 
-The lit body is a hemisphere on a lit cylinder, the collar, of the same radius. Seen from the pupil its outline
-is the hull of a circle (the tangent cone of the sphere, cut by the plane across the line of sight) and of an
-ellipse (the collar's rear rim), joined by straight lines: area and centroid have closed forms, perspective
-included. By symmetry the centroid is off the sphere's centre along the projected axis only. From the plane
+The lit body is a hemisphere on a lit cylinder, the collar, of the same radius. Seen from the pupil its
+outline is the hull of a circle (the tangent cone of the sphere, cut by the plane across the line of sight) and
+of an ellipse (the collar's rear rim), joined by straight lines: area and centroid have closed forms,
+perspective included. By symmetry the centroid is off the sphere's centre along the projected axis only. From the plane
 across the line of sight to the picture it goes through the ray model, at four points that carry the area's
 second moments, weighted by the local magnification: lens distortion across an LED is some 0.1 px.
 
 Where the collar was never fitted (`BrickModel.led_profile` is `None`) the centroid is taken for the image of
-the sphere's centre, and the covariance is widened along the projected axis.
+the sphere's centre, with an uncertainty along the projected axis that all LEDs share.
 """
 
 from dataclasses import dataclass
@@ -24,6 +24,10 @@ from bricktrack_common.rotations import skew
 UNKNOWN_SHIFT_PER_RADIUS = 0.1
 """Standard deviation of the unknown shift, in LED radii times the sine of the view angle: between a bare
 hemisphere (+0.19 r at 57 degrees) and a collar of two thirds of r (-0.09 r)."""
+
+FITTED_SHIFT_PER_RADIUS = 0.005
+"""The same for a fitted profile, which is one of shape, not of brightness: limb darkening and the lens's blur
+leave thresholded centroids up to 0.3 px off the outline's at a radius of 60 px (path-traced sample)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,8 +46,8 @@ class LedPrediction:
         Of the outline; of the full disc where the profile is unknown.
     facing : ndarray, shape (...,)
         Cosine between the axis and the line of sight to the camera; an LED with 0 or less cannot be seen.
-    model_cov_px2 : ndarray, shape (..., 2, 2), px^2
-        Of what the profile leaves unknown; zero for a fitted one.
+    model_shift_px : ndarray, shape (..., 2), px
+        One standard deviation of what the profile leaves unknown, the same way in all LEDs of a type.
     """
 
     uv_px: FloatArray
@@ -51,7 +55,7 @@ class LedPrediction:
     J_px_per_axis: FloatArray
     area_px2: FloatArray
     facing: FloatArray
-    model_cov_px2: FloatArray
+    model_shift_px: FloatArray
 
 
 def outline_moments(
@@ -69,13 +73,13 @@ def outline_moments(
     Returns
     -------
     area_mm2, centroid_mm, half_length_mm : ndarray, shape (...,)
-        In the plane through the sphere's centre across the line of sight; the centroid and the half length are
-        along the projected axis, positive towards where the dome points.
+        In the plane through the sphere's centre across the line of sight; centroid and half length are along
+        the projected axis, positive towards where the dome points.
 
     Notes
     -----
-    Without collar and from afar the centroid is ``(4 r / 3 pi)(1 - c)``. Green's theorem over half the outline:
-    the circle's arc to the common tangent, the tangent, the ellipse's arc.
+    Without collar and from afar the centroid is ``(4 r / 3 pi)(1 - c)``. Green's theorem over half the
+    outline: the circle's arc to the common tangent, the tangent, the ellipse's arc.
     """
     c, r, h, D = np.broadcast_arrays(
         *(np.asarray(x, dtype=np.float64) for x in (facing, radius_mm, collar_mm, distance_mm))
@@ -148,30 +152,25 @@ def predict_leds(
         other /= np.linalg.norm(other, axis=-1, keepdims=True)
         e1 = np.where(s[..., None] > 1e-6, across / s[..., None], other)
     e2 = np.cross(d, e1)
-    if collar_mm is None:
-        J1 = np.einsum("...ij,...j->...i", J0, e1)
-        J2 = np.einsum("...ij,...j->...i", J0, e2)
-        sd_mm = UNKNOWN_SHIFT_PER_RADIUS * radii * s
-        det = np.abs(J1[..., 0] * J2[..., 1] - J1[..., 1] * J2[..., 0])
-        return LedPrediction(
-            uv_px=at_centre.uv_px,
-            J_px_per_mm=J0,
-            J_px_per_axis=np.zeros_like(J0),
-            area_px2=np.pi * radii**2 * det,
-            facing=facing,
-            model_cov_px2=sd_mm[..., None, None] ** 2 * J1[..., :, None] * J1[..., None, :],
-        )
     distance = centres[..., 2] / d[..., 2]
-    step = 1e-4
-    c = np.clip(facing, -1 + 2 * step, 1 - 2 * step)
-    area, shift, half_length = outline_moments(
-        np.stack([c, c - step, c + step]), radius_mm=radii, collar_mm=collar_mm, distance_mm=distance
-    )
-    per_s = shift / np.sqrt(1 - np.stack([c, c - step, c + step]) ** 2)
-    slope = (per_s[2] - per_s[1]) / (2 * step)
-    middle = centres + (per_s[0] * s)[..., None] * e1
+    if collar_mm is None:  # the sphere's own outline, and a shift along the projected axis that is not known
+        half_length = radii / np.sqrt(1 - (radii / distance) ** 2)
+        area, per_s, slope = np.pi * half_length**2, np.zeros_like(s), np.zeros_like(s)
+        unknown_mm = UNKNOWN_SHIFT_PER_RADIUS * radii * s
+    else:
+        step = 1e-4
+        c = np.clip(facing, -1 + 2 * step, 1 - 2 * step)
+        near = np.stack([c, c - step, c + step])
+        areas, shifts, half_lengths = outline_moments(
+            near, radius_mm=radii, collar_mm=collar_mm, distance_mm=distance
+        )
+        ratio = shifts / np.sqrt(1 - near**2)
+        area, half_length, per_s = areas[0], half_lengths[0], ratio[0]
+        slope = (ratio[2] - ratio[1]) / (2 * step)
+        unknown_mm = FITTED_SHIFT_PER_RADIUS * radii * s
+    middle = centres + (per_s * s)[..., None] * e1
     # Four points with the area's second moments: exact for a quadratic map.
-    spread = np.sqrt(0.5) * np.stack([half_length[0], radii])[..., None] * np.stack([e1, e2])
+    spread = np.sqrt(0.5) * np.stack([half_length, radii])[..., None] * np.stack([e1, e2])
     points = middle + np.concatenate([spread, -spread])
     seen = ray_model.project(points)
     J1 = np.einsum("...ij,...j->...i", seen.J_px_per_mm, e1)
@@ -181,16 +180,16 @@ def predict_leds(
     J = np.einsum("k...,k...ij->...ij", weight, seen.J_px_per_mm)
     # shift = per_s(c) * across(n), c = -n.d: its derivative by the axis n.
     dd = d[..., :, None] * d[..., None, :]
-    d_shift = per_s[0][..., None, None] * (np.eye(3) - dd) - slope[..., None, None] * (
+    d_shift = per_s[..., None, None] * (np.eye(3) - dd) - slope[..., None, None] * (
         across[..., :, None] * d[..., None, :]
     )
     return LedPrediction(
         uv_px=np.einsum("k...,k...i->...i", weight, seen.uv_px),
         J_px_per_mm=J,
         J_px_per_axis=J @ d_shift,
-        area_px2=area[0] * det.mean(axis=0),
+        area_px2=area * det.mean(axis=0),
         facing=facing,
-        model_cov_px2=np.zeros((*centres.shape[:-1], 2, 2)),
+        model_shift_px=unknown_mm[..., None] * np.einsum("k...,k...i->...i", weight, J1),
     )
 
 

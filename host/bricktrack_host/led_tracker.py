@@ -1,81 +1,35 @@
-"""Follow the LEDs through a video: pictures in, identified centroids out.
+"""From the pictures of a run to identified centroids.
 
-Each picture is searched decimated (cheap, and blind to no motion), the finds are identified by the track, or
-from nothing at the start and after loss, and only the LEDs are measured at full resolution. When all pictures
-are through, the areas are compared with what each LED shows in the run: those partly covered or run together
-with another light are flagged.
+Each picture is searched decimated, which is cheap and blind to no motion, and every find of an LED's size
+is measured at full resolution; no picture is kept. Then the run is identified (`led_identity`), and the areas
+are compared with what each LED shows in the rest of the run: LEDs partly covered, or run together with another
+light, are flagged.
 """
 
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
-from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
-from bricktrack_host.correspondence import (
-    MIN_INLIERS,
-    Correspondence,
-    assign_predicted,
-    correspondence_from,
-    identity_gate_px,
-    is_paper_layout,
-    no_correspondence,
-    paper_hypotheses,
-    search_correspondence,
-    verify,
-)
+from bricktrack_host.correspondence import MIN_INLIERS
+from bricktrack_host.led_identity import Identities, SegmentMethod, identify_run
 from bricktrack_host.led_profile import collar_of, predict_brick
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.segment import (
-    Blobs,
-    Candidates,
-    PaperLimits,
-    Picture,
-    find_candidates,
-    measure_candidates,
-    paper_filter,
-)
+from bricktrack_host.segment import Blobs, PaperLimits, Picture, find_blobs, paper_filter
 from bricktrack_host.tracks import LedObservations
 
 logger = logging.getLogger(__name__)
 
-SegmentMethod = Literal["default", "paper"]
-
-_MAX_COAST_S = 0.5  # after so long without a pose the prediction says nothing of a shaken brick
 _AREA_SIGMAS = 6.0
 _AREA_FLOOR = 0.015  # a dome behind an edge that hides this share of it moves its centroid by some 0.7 px
 _BLUR_COV_SHARE = 0.03
 """Error of mid-exposure, as a share of the length of the smear: the motion is not uniform during exposure."""
 NOT_USED = LedFlag.MISSING | LedFlag.BORDER | LedFlag.PARTLY_COVERED | LedFlag.MERGED
-
-
-@dataclass(slots=True)
-class _Track:
-    """The last verified pose and how it was moving."""
-
-    t_ns: int
-    R: FloatArray
-    t: FloatArray
-    omega_radps: FloatArray
-    v_mmps: FloatArray
-
-    def predicted(self, t_ns: int) -> tuple[FloatArray, FloatArray]:
-        dt = (t_ns - self.t_ns) * 1e-9
-        dt = float(np.clip(dt, -0.05, 0.05))  # velocity turns back within a shake's half period
-        return self.R @ matrix_from_rvec(self.omega_radps * dt), self.t + self.v_mmps * dt
-
-    def moved(self, t_ns: int, R: FloatArray, t: FloatArray) -> "_Track":
-        dt = (t_ns - self.t_ns) * 1e-9
-        if not 0 < dt < 0.1:
-            return _Track(t_ns, R, t, np.zeros(3), np.zeros(3))
-        return _Track(t_ns, R, t, rvec_from_matrix(self.R.T @ R) / dt, (t - self.t) / dt)
 
 
 def observe_leds(
@@ -118,7 +72,8 @@ def observe_leds(
     exposure = np.asarray(exposure_ns, dtype=np.int64)
     if stamps.ndim != 1 or stamps.shape != exposure.shape:
         raise TrackingError(
-            f"sensor time stamps have shape {stamps.shape}, exposures {exposure.shape}; expected one each a frame"
+            f"sensor time stamps have shape {stamps.shape}, exposures {exposure.shape}; expected one of each "
+            "a frame"
         )
     if method not in ("default", "paper"):
         raise TrackingError(f"segmentation method is {method!r}; expected 'default' or 'paper'")
@@ -132,33 +87,50 @@ def observe_leds(
         led_flags=np.full((n, n_leds), int(LedFlag.MISSING), dtype=np.int64),
         frame_flags=np.full(n, int(PoseFlag.FRAME_LOST | PoseFlag.NO_POSE), dtype=np.int64),
     )
-    finder = _Finder(ray_model, brick_model, method)
-    R = np.full((n, 3, 3), np.nan)
-    t = np.full((n, 3), np.nan)
+    radius_px = usual_radius_px(ray_model, brick_model)
+    limits = PaperLimits.for_radius(radius_px)
+    lights: list[Blobs | None] = [None] * n
     mode = ray_model.sensor_mode
     last = -1
     for done, (i, picture) in enumerate(pictures, start=1):
         if not last < i < n:
             raise TrackingError(
-                f"picture of frame {i} after frame {last}, with {n} time stamps; expected rising indices below that"
+                f"picture of frame {i} after frame {last}, with {n} time stamps; expected rising indices below "
+                "their number"
             )
         if picture.luma.shape != (mode.height, mode.width):
             raise TrackingError(
-                f"frame {i} has {picture.luma.shape[1]} x {picture.luma.shape[0]} pixels; the calibration is of "
-                f"mode {mode.name}, {mode.width} x {mode.height}. Use the calibration of the run's mode."
+                f"frame {i} has {picture.luma.shape[1]} x {picture.luma.shape[0]} pixels; the calibration is "
+                f"of mode {mode.name}, {mode.width} x {mode.height}. Use the calibration of the run's mode."
             )
         last = i
-        found, blobs = finder.find(int(stamps[i]), picture)
-        out.frame_flags[i] = _frame_flags(found, n_leds)
-        leds = np.flatnonzero(found.blob_of_led >= 0)
-        index = found.blob_of_led[leds]
+        lights[i] = (
+            paper_filter(picture, limits=limits)
+            if method == "paper"
+            else find_blobs(picture, radius_px=radius_px)
+        )
+        if progress is not None:
+            progress(done)
+    found = identify_run(
+        lights,
+        stamps,
+        ray_model,
+        brick_model,
+        radius_px=radius_px,
+        collar_mm=collar_of(brick_model),
+        method=method,
+    )
+    for i, blobs in enumerate(lights):
+        if blobs is None:
+            continue
+        out.frame_flags[i] = _frame_flags(found, i)
+        leds = np.flatnonzero(found.blob_of_led[i] >= 0)
+        index = found.blob_of_led[i, leds]
         out.uv_px[i, leds] = blobs.uv_px[index]
         out.cov_px2[i, leds] = blobs.cov_px2[index]
         out.area_px2[i, leds] = blobs.area_px2[index]
         out.led_flags[i, leds] = blobs.flags[index]
-        R[i], t[i] = found.R_camera_brick, found.t_camera_brick_mm
-        if progress is not None:
-            progress(done)
+    R, t = found.R_camera_brick, found.t_camera_brick_mm
     _flag_areas(out, R, t, ray_model, brick_model)
     _widen_blurred(out)
     seen = np.isfinite(out.uv_px).all(axis=-1)
@@ -171,125 +143,16 @@ def observe_leds(
     return out
 
 
-def _frame_flags(found: Correspondence, n_leds: int) -> int:
-    if found.n_found == 0:
-        return int(PoseFlag.NO_POSE | PoseFlag.AMBIGUOUS if found.is_ambiguous else PoseFlag.NO_POSE)
-    flags = PoseFlag.NONE if found.n_found == n_leds else PoseFlag.LED_MISSING
-    if found.n_found == MIN_INLIERS:
-        flags |= PoseFlag.UNVERIFIED
-    return int(flags)
+def _frame_flags(found: Identities, i: int) -> int:
+    n_found = int((found.blob_of_led[i] >= 0).sum())
+    if n_found == 0:
+        ambiguous = PoseFlag.AMBIGUOUS if found.is_ambiguous[i] else PoseFlag.NONE
+        return int(PoseFlag.NO_POSE | ambiguous)
+    flags = PoseFlag.NONE if n_found == found.blob_of_led.shape[1] else PoseFlag.LED_MISSING
+    return int(flags | PoseFlag.UNVERIFIED if n_found == MIN_INLIERS else flags)
 
 
-class _Finder:
-    """The LEDs of one picture after the other; holds the track between them."""
-
-    def __init__(self, ray_model: RayModel, brick_model: BrickModel, method: SegmentMethod) -> None:
-        self._rays = ray_model
-        self._brick = brick_model
-        self._method = method
-        self._collar_mm = collar_of(brick_model)
-        self._radius_px = _usual_radius_px(ray_model, brick_model)
-        self._limits = PaperLimits.for_radius(self._radius_px)
-        self._track: _Track | None = None
-
-    def find(self, t_ns: int, picture: Picture) -> tuple[Correspondence, Blobs]:
-        """Return the identities of a picture's lights, and the lights."""
-        if self._track is not None and (t_ns - self._track.t_ns) * 1e-9 > _MAX_COAST_S:
-            self._track = None
-        if self._method == "paper":
-            blobs = paper_filter(picture, limits=self._limits)
-            found = self._by_paper(blobs)
-            if found.n_found == 0:
-                found = self._by_track(t_ns, blobs)
-        else:
-            candidates = find_candidates(picture, radius_px=self._radius_px)
-            found, blobs = self._near_track(t_ns, picture, candidates)
-            if found.n_found == 0:
-                blobs = measure_candidates(picture, candidates)
-        if found.n_found == 0:
-            found = search_correspondence(blobs, self._rays, self._brick, collar_mm=self._collar_mm)
-        if found.n_found:
-            R, t = found.R_camera_brick, found.t_camera_brick_mm
-            still = _Track(t_ns, R, t, np.zeros(3), np.zeros(3))
-            self._track = still if self._track is None else self._track.moved(t_ns, R, t)
-        return found, blobs
-
-    def _near_track(
-        self, t_ns: int, picture: Picture, candidates: Candidates
-    ) -> tuple[Correspondence, Blobs]:
-        """Measure the finds that the track takes for LEDs, and verify them."""
-        rough = self._assign(t_ns, candidates.uv_px)
-        chosen = rough[rough >= 0]
-        blobs = measure_candidates(
-            picture, Candidates(candidates.uv_px[chosen], candidates.half_size_px[chosen])
-        )
-        return self._by_track(t_ns, blobs), blobs
-
-    def _by_track(self, t_ns: int, blobs: Blobs) -> Correspondence:
-        none = no_correspondence(self._brick.n_leds, "no track")
-        if self._track is None or len(blobs) < MIN_INLIERS:
-            return none
-        found = correspondence_from(
-            blobs,
-            self._assign(t_ns, blobs.uv_px),
-            self._track.predicted(t_ns),
-            self._rays,
-            self._brick,
-            collar_mm=self._collar_mm,
-            gate_px=identity_gate_px(self._radius_px),
-            max_steps=3,
-        )
-        # Half of the lights unexplained: the track holds on to the wrong ones.
-        good = int((blobs.flags == 0).sum())
-        return found if found.n_found >= min(good, self._brick.n_leds) - 2 else none
-
-    def _assign(self, t_ns: int, uv_px: FloatArray) -> IntArray:
-        if self._track is None:
-            return np.full(self._brick.n_leds, -1, dtype=np.int64)
-        R, t = self._track.predicted(t_ns)
-        prediction, _ = predict_brick(R[None], t[None], self._rays, self._brick, collar_mm=None)
-        predicted = np.where(prediction.facing[0, :, None] > 0, prediction.uv_px[0], np.nan)
-        gaps = np.linalg.norm(predicted[:, None] - predicted[None], axis=-1)
-        closest = float(np.nanmin(np.where(gaps > 0, gaps, np.nan))) if np.isfinite(gaps).any() else 0.0
-        return assign_predicted(
-            uv_px,
-            predicted,
-            gate_px=max(0.45 * closest, 2 * self._radius_px / 3),
-            shift_limit_px=10 * self._radius_px,
-        )
-
-    def _by_paper(self, blobs: Blobs) -> Correspondence:
-        n_leds = self._brick.n_leds
-        if not is_paper_layout(self._brick):
-            return no_correspondence(n_leds, "not the paper's layout")
-        hypotheses = paper_hypotheses(blobs, self._rays)
-        if len(hypotheses) == 0:
-            return no_correspondence(n_leds, "no seven blobs obey the paper's rules")
-        kept, poses = verify(
-            blobs,
-            hypotheses,
-            None,
-            self._rays,
-            self._brick,
-            collar_mm=self._collar_mm,
-            gate_px=identity_gate_px(self._radius_px),
-        )
-        whole = np.flatnonzero((kept >= 0).all(axis=1))
-        if len(whole) == 0:
-            return no_correspondence(n_leds, "reprojection refutes the paper's rules")
-        best = int(whole[np.argmin(poses.chi2[whole])])
-        r = poses.residual_px[best]
-        return Correspondence(
-            blob_of_led=kept[best],
-            R_camera_brick=poses.R_camera_brick[best],
-            t_camera_brick_mm=poses.t_camera_brick_mm[best],
-            rms_px=float(np.sqrt(np.mean(np.sum(r**2, axis=-1)))),
-            is_ambiguous=False,
-            reason="",
-        )
-
-
-def _usual_radius_px(ray_model: RayModel, brick_model: BrickModel) -> float:
+def usual_radius_px(ray_model: RayModel, brick_model: BrickModel) -> float:
     """Return the radius of an LED midway between the calibrated planes, at the picture's middle, px."""
     mode = ray_model.sensor_mode
     z = 0.5 * (ray_model.plane_a_mm + ray_model.plane_b_mm)

@@ -13,10 +13,12 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_host.correspondence import prsoi_starts
+from bricktrack_host.led_identity import SegmentMethod
 from bricktrack_host.led_profile import collar_of
-from bricktrack_host.led_tracker import NOT_USED, SegmentMethod, observe_leds
+from bricktrack_host.led_tracker import NOT_USED, observe_leds
 from bricktrack_host.p3p import ray_centre_mm, rays_of, solve_p3p
-from bricktrack_host.prsoi import PrsoiForm, prsoi_poses
+from bricktrack_host.prsoi import PrsoiForm
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.refine import MIN_LEDS, LedMotion, RefinedPoses, refine_poses
 from bricktrack_host.tracks import LedObservations, OpticalTrack
@@ -75,13 +77,13 @@ def solve_poses(
     n, n_leds = observations.uv_px.shape[:2]
     if n_leds != brick_model.n_leds or len(observations.sensor_timestamp_ns) != n:
         raise TrackingError(
-            f"observations are of {n_leds} LEDs in {n} frames with {len(observations.sensor_timestamp_ns)} time "
-            f"stamps; the layout '{brick_model.name}' has {brick_model.n_leds} LEDs"
+            f"observations are of {n_leds} LEDs in {n} frames with {len(observations.sensor_timestamp_ns)} "
+            f"time stamps; the layout '{brick_model.name}' has {brick_model.n_leds} LEDs"
         )
     t_ns, led_t_ns = led_times_ns(observations, ray_model)
     used = ((observations.led_flags & NOT_USED) == 0) & np.isfinite(observations.uv_px).all(axis=-1)
     uv = np.where(used[..., None], observations.uv_px, np.nan)
-    start_R, start_t = _prsoi(uv, ray_model, brick_model, form)
+    start_R, start_t = prsoi_starts(uv, ray_model, brick_model, form)
     flags = np.asarray(observations.frame_flags, dtype=np.int64).copy()
     if not refined:
         return _finish(
@@ -124,17 +126,6 @@ def solve_poses(
         np.isfinite(uv).all(axis=-1),
         brick_model,
     )
-
-
-def _prsoi(
-    uv: FloatArray, ray_model: RayModel, brick_model: BrickModel, form: PrsoiForm
-) -> tuple[FloatArray, FloatArray]:
-    a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
-    on_a, on_b = np.full_like(uv, np.nan), np.full_like(uv, np.nan)
-    seen = np.isfinite(uv).all(axis=-1)
-    on_a[seen], on_b[seen] = ray_model.points_on_plane(uv[seen], a), ray_model.points_on_plane(uv[seen], b)
-    found = prsoi_poses(on_a, on_b, brick_model.led_positions_mm, plane_a_mm=a, plane_b_mm=b, form=form)
-    return found.R_camera_brick, found.t_camera_brick_mm
 
 
 def _dof(uv: FloatArray) -> FloatArray:
@@ -218,7 +209,7 @@ def _believe_neighbours(
     frames: IntArray,
     t_ns: IntArray,
 ) -> None:
-    """Settle frames with two poses by the frame before or after, where that is near one and far from the other."""
+    """Settle frames with two poses by the frame beside them, where that is near one and far from the other."""
     period = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
     row_of = {int(i): row for row, i in enumerate(frames)}
     for order in (range(len(t_ns)), range(len(t_ns) - 1, -1, -1)):
@@ -262,7 +253,7 @@ def _without_outliers(uv: FloatArray, poses: RefinedPoses) -> FloatArray:
 
 
 def _motion_to_leds(t_ns: IntArray, led_t_ns: IntArray, poses: RefinedPoses) -> LedMotion:
-    """Return how far the brick moves from each frame's instant to each LED's, by cubic splines over frames."""
+    """Return how far the brick moves from each frame's instant to each LED's, by splines over frames."""
     n, n_leds = led_t_ns.shape
     rvec, shift = np.zeros((n, n_leds, 3)), np.zeros((n, n_leds, 3))
     valid = np.flatnonzero(np.isfinite(poses.R_camera_brick).all(axis=(1, 2)))

@@ -1,7 +1,7 @@
 """Poses from three rays and three LEDs: at most four of each, by Grunert's quartic, vectorised.
 
-Needs rays through one point; for a camera without one, the point nearest to all rays serves, and the poses are
-starts for the refinement, which asks the ray model itself.
+Needs rays through one point; for a camera without one, the point nearest to all rays serves, and the poses
+are starts for the refinement, which asks the ray model itself.
 """
 
 import numpy as np

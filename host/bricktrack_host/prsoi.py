@@ -1,14 +1,15 @@
-"""PRSOI: pose recovery from calibrated incident rays by scaled orthographic iteration, after the source paper.
+"""PRSOI, the source paper's pose recovery: scaled orthography, iterated, on calibrated incident rays.
 
-Each LED is known as the ray of its pixel, given by its hits on two planes z = a and z = b. As a first guess all
-LEDs lie in one plane parallel to the image (scaled orthography), which makes the pose linear in the hits; the
-depths that this pose gives the LEDs correct the hits, and so on. No start is needed, and no projection centre.
+Each LED is known as the ray of its pixel, given by its hits on two planes z = a and z = b. As a first guess
+all LEDs lie in one plane parallel to the image (scaled orthography), which makes the pose linear in the hits;
+the depths that this pose gives the LEDs correct the hits, and so on. It needs no start and no projection
+centre.
 
 Two differences from the paper as printed. Its eq. 21 takes ``k = -(i x j)``; in right-handed frames it must be
-``k = i x j``, or the iteration converges to wrong poses without a sign. And its eqs 6 and 20 divide, LED by LED
-and axis by axis, by the hits' distances from the origin LED's, which are zero for LEDs in line with it: the
-"safe" form, the default, takes one ratio ``kappa`` for all LEDs and both axes. The "printed" form stays for
-comparison with the literature.
+``k = i x j``, or the iteration converges to wrong poses without a sign. And its eqs 6 and 20 divide, LED by
+LED and axis by axis, by the hits' distances from the origin LED's, which are zero for LEDs in line with it:
+the "safe" form, the default, takes one ratio ``kappa`` for all LEDs and both axes. The "printed" form stays
+for comparison with the literature.
 
 Everything is vectorised over frames, each with its own set of seen LEDs.
 """
@@ -77,9 +78,9 @@ def prsoi_poses(
 
     Notes
     -----
-    Paper eqs 6, 7, 15, 18-27 with ``k = i x j``. The reference is the first seen LED, m0 of the paper where it
-    is seen; ``t`` is always that of the brick's origin. In the printed form ``m`` of eq. 20 is averaged over
-    LEDs and axes.
+    Paper eqs 6, 7, 15, 18-27 with ``k = i x j``. The reference is the first seen LED, m0 of the paper where
+    it is seen; ``t`` is always that of the brick's origin. In the printed form ``m`` of eq. 20 is averaged
+    over LEDs and axes.
     """
     if form not in ("safe", "printed"):
         raise ShapeError(f"PRSOI form is {form!r}; expected 'safe' or 'printed'")
@@ -118,8 +119,8 @@ def _iterate(
     reference = np.argmax(seen, axis=1)
     rows = np.arange(n)
     G = np.where(seen[..., None], P[None] - P[reference][:, None], 0.0)
-    flat = np.linalg.svd(G, compute_uv=False)[..., -1] < _MIN_DEPTH_MM if n else np.zeros(0, dtype=bool)
-    active = rows[(seen.sum(axis=1) >= 4) & ~flat]
+    depth_mm = np.linalg.svd(G, compute_uv=False)[..., -1]
+    active = rows[(seen.sum(axis=1) >= 4) & (depth_mm >= _MIN_DEPTH_MM)]
     if active.size == 0:
         return PrsoiPoses(R_all, t_all, converged, n_iterations)
     G, seen, reference = G[active], seen[active], reference[active]

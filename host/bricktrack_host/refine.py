@@ -5,11 +5,11 @@ covariance, and taken at the LED's own instant: the caller gives how far the bri
 frame's instant and the LED's.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
@@ -20,6 +20,7 @@ HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
 OUTLIER_SIGMAS = 5.0
 MIN_LEDS = 4
+_DONE_SIGMAS = 1e-3  # a last step this small, and the next smaller still, is far below the pose's own error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,12 +74,20 @@ class RefinedPoses:
     area_px2: FloatArray
     facing: FloatArray
 
+    def replaced(self, rows: IntArray, by: "RefinedPoses") -> "RefinedPoses":
+        """Return these poses with those of some frames replaced."""
+        values = {f.name: getattr(self, f.name).copy() for f in fields(self)}
+        for name, value in values.items():
+            value[rows] = getattr(by, name)
+        return RefinedPoses(**values)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evaluation:
     cost: FloatArray
     A: FloatArray
     g: FloatArray
+    shift: FloatArray
     residual: FloatArray
     sigmas: FloatArray
     area: FloatArray
@@ -113,18 +122,19 @@ def refine_poses(
     motion : LedMotion, optional
         Rolling shutter; default none.
     max_steps : int
-        Frames stop when their step is below a nanometre or so; two to four do from a PRSOI start.
+        Frames stop when their step is a thousandth of their uncertainty; two to four do from PRSOI.
 
     Notes
     -----
     Levenberg-Marquardt damping frame by frame, so that no step raises the Huber cost. The covariance is the
-    inverse of the normal matrix with the robust weights, undamped.
+    inverse of the normal matrix with the robust weights, undamped. An unfitted LED profile shifts all LEDs of
+    a type alike, so its part of the covariance is that of one common unknown, not of independent ones.
     """
     n, n_leds = uv_px.shape[:2]
     if uv_px.shape != (n, brick_model.n_leds, 2) or cov_px2.shape != (n, n_leds, 2, 2):
         raise TrackingError(
-            f"centroids have shape {uv_px.shape} and covariances {cov_px2.shape} for {brick_model.n_leds} LEDs; "
-            "expected (n, n_leds, 2) and (n, n_leds, 2, 2)"
+            f"centroids have shape {uv_px.shape} and covariances {cov_px2.shape} for "
+            f"{brick_model.n_leds} LEDs; expected (n, n_leds, 2) and (n, n_leds, 2, 2)"
         )
     out = _nothing(n, n_leds)
     seen = np.isfinite(uv_px).all(axis=-1) & np.isfinite(cov_px2).all(axis=(-2, -1))
@@ -136,7 +146,7 @@ def refine_poses(
     exp_led = None if motion is None else matrix_from_rvec(motion.rvec_brick_rad)
     shift = None if motion is None else motion.shift_camera_mm
 
-    def evaluate(which: FloatArray, R: FloatArray, t: FloatArray) -> _Evaluation:
+    def evaluate(which: IntArray, R: FloatArray, t: FloatArray) -> _Evaluation:
         R_led, t_led = R, t
         if exp_led is not None and shift is not None:
             R_led, t_led = R[:, None] @ exp_led[which], t[:, None] + shift[which]
@@ -144,14 +154,12 @@ def refine_poses(
             uv_px[which],
             cov_px2[which],
             seen[which],
-            R,
             R_led,
             t_led,
             ray_model,
             brick_model,
             collar_mm,
-            exp_led,
-            which,
+            None if exp_led is None else exp_led[which],
         )
 
     state = evaluate(frames, R, t)
@@ -174,11 +182,11 @@ def refine_poses(
         better = new.cost <= state.cost[todo] * (1 + 1e-12) + 1e-12
         took, kept = todo[better], todo[~better]
         R[took], t[took] = R_new[better], t_new[better]
-        for name in ("cost", "A", "g", "residual", "sigmas", "area", "facing"):
+        for name in ("cost", "A", "g", "shift", "residual", "sigmas", "area", "facing"):
             getattr(state, name)[took] = getattr(new, name)[better]
         damping[took] = np.maximum(damping[took] / 10, 1e-9)
         damping[kept] = np.maximum(damping[kept] * 100, 1e-4)
-        small = (np.abs(step[:, :3]).max(axis=1) < 1e-8) & (np.abs(step[:, 3:]).max(axis=1) < 1e-6)
+        small = np.einsum("ni,nij,nj->n", step, A, step) < _DONE_SIGMAS**2
         live[todo[small & better]] = False
         live[damping > 1e6] = False
     good = np.isfinite(state.cost)
@@ -186,7 +194,9 @@ def refine_poses(
     good[np.flatnonzero(good)[condition > 1e14]] = False
     rows = frames[good]
     out.R_camera_brick[rows], out.t_camera_brick_mm[rows] = R[good], t[good]
-    out.covariance[rows] = np.linalg.inv(state.A[good])
+    inverse = np.linalg.inv(state.A[good])
+    shared = np.einsum("nij,nj->ni", inverse, state.shift[good])
+    out.covariance[rows] = inverse + shared[:, :, None] * shared[:, None, :]
     out.residual_px[rows], out.sigmas[rows] = state.residual[good], state.sigmas[good]
     out.is_outlier[rows] = np.nan_to_num(state.sigmas[good]) > OUTLIER_SIGMAS
     out.chi2[rows] = state.cost[good]
@@ -199,22 +209,21 @@ def _evaluate(
     uv: FloatArray,
     cov: FloatArray,
     seen: BoolArray,
-    R: FloatArray,
     R_led: FloatArray,
     t_led: FloatArray,
     ray_model: RayModel,
     brick_model: BrickModel,
     collar_mm: float | None,
     exp_led: FloatArray | None,
-    which: FloatArray,
 ) -> _Evaluation:
     prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_mm)
     if exp_led is not None:
         # R_led = R E: a turn dtheta of the frame's brick is E^T dtheta of the LED's.
         J = J.copy()
-        J[..., :3] = J[..., :3] @ np.swapaxes(exp_led[which], -1, -2)
+        J[..., :3] = J[..., :3] @ np.swapaxes(exp_led, -1, -2)
     residual = np.where(seen[..., None], uv - prediction.uv_px, 0.0)
-    C = np.where(seen[..., None, None], cov + prediction.model_cov_px2, np.eye(2))
+    m = prediction.model_shift_px
+    C = np.where(seen[..., None, None], cov + m[..., :, None] * m[..., None, :], np.eye(2))
     det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] ** 2
     W = np.empty_like(C)
     W[..., 0, 0], W[..., 1, 1] = C[..., 1, 1] / det, C[..., 0, 0] / det
@@ -228,6 +237,7 @@ def _evaluate(
     n, n_leds = seen.shape
     A = np.swapaxes(J.reshape(n, 2 * n_leds, 6), 1, 2) @ WJ.reshape(n, 2 * n_leds, 6)
     g = np.einsum("nlik,nli->nk", WJ, residual)
+    shift = np.einsum("nlik,nli->nk", WJ, m)
     behind = (t_led[..., 2] <= 0).any(axis=-1) if t_led.ndim == 3 else t_led[..., 2] <= 0
     cost = np.where(seen, huber, 0.0).sum(axis=1)
     cost = np.where(behind | ~np.isfinite(A).all(axis=(1, 2)), np.inf, cost)
@@ -235,6 +245,7 @@ def _evaluate(
         cost=cost,
         A=A,
         g=g,
+        shift=shift,
         residual=np.where(seen[..., None], residual, np.nan),
         sigmas=np.where(seen, sigmas, np.nan),
         area=prediction.area_px2,

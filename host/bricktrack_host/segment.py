@@ -18,10 +18,11 @@ from bricktrack_host.quality import LedFlag
 
 Plane = NDArray[np.uint8]
 
-_LEVELS = (0.7, 0.5, 0.35, 0.22, 0.13)
+_LEVELS = (0.55, 0.28, 0.12)
 """Fractions of the brightest light at which the decimated picture is cut: LEDs of one brick differ in
 brightness, and a lamp or a reflection may outshine them."""
 _MAX_CANDIDATES = 40
+_MIN_BOX_SHARE = 0.45
 _MIN_FILL = 0.90  # a disc behind a straight edge keeps 0.93 and more; rings, arcs and pairs have less
 _MAX_ECCENTRICITY = 0.87  # a hemisphere seen from the side: half a disc, 0.85
 
@@ -114,7 +115,7 @@ def find_candidates(picture: Picture, *, radius_px: float | None = None) -> Cand
         About the radius of an LED; sets the decimation (at most 8) and the sizes that are believed: a third
         of it to three times it. Default: from 6 px to an eighth of the picture's height.
     """
-    rows, columns = picture.luma.shape
+    rows = picture.luma.shape[0]
     smallest = 6.0 if radius_px is None else max(radius_px / 3, 2.0)
     largest = rows / 8 if radius_px is None else 3 * radius_px
     step = int(np.clip(smallest * 1.2, 1, 8))
@@ -122,7 +123,7 @@ def find_candidates(picture: Picture, *, radius_px: float | None = None) -> Cand
     small = np.ascontiguousarray(picture.luma[first::step, first::step])
     light = linear_light_of_luma()
     brightest = float(light[int(small.max())])
-    background = float(light[int(np.median(small))])
+    background = float(light[int(np.median(small[::3, ::3]))])
     owner = np.full(small.shape, -1, dtype=np.int32)
     centres: list[tuple[float, float]] = []
     sizes: list[tuple[float, float]] = []
@@ -132,20 +133,24 @@ def find_candidates(picture: Picture, *, radius_px: float | None = None) -> Cand
     for fraction in _LEVELS:
         cut = int(np.searchsorted(light, background + fraction * (brightest - background)))
         mask = cv2.threshold(small, max(cut - 1, 0), 255, cv2.THRESH_BINARY)[1]
-        n, labels, stats, middles = cv2.connectedComponentsWithStats(mask, connectivity=8)
-        for i in range(1, n):
+        n, labels, stats, middles = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
+        width, height, areas = stats[:, 2], stats[:, 3], stats[:, 4]
+        fits = (areas >= low_area) & (areas <= high_area)
+        longest = np.maximum(width, height)
+        fits &= (longest <= 3 * np.minimum(width, height) + 2) & (longest * step <= 2 * largest)
+        # A disc fills 0.79 of its box; lamps' rings and arcs, cables and rims of things do not.
+        fits &= (areas >= _MIN_BOX_SHARE * width * height) | (areas <= 9)
+        for i in np.flatnonzero(fits[1:]) + 1:
             x, y, w, h, area = (int(s) for s in stats[i])
-            if not low_area <= area <= high_area or max(w, h) > 3 * min(w, h) + 2:
-                continue
             box = (slice(y, y + h), slice(x, x + w))
             own = labels[box] == i
-            known = np.unique(owner[box][own])
+            known = owner[box][own]
             known = known[known >= 0]
-            if known.size > 1 or (known.size == 1 and area < 0.6 * w * h):
+            if known.size and (known.min() != known.max() or area < 0.6 * w * h):
                 continue  # two lights run together at this level, or one light with what surrounds it
             centre = (first + step * float(middles[i, 0]), first + step * float(middles[i, 1]))
             size = (0.5 * step * w, 0.5 * step * h)
-            if known.size == 1:  # the same light, cut nearer to its rim
+            if known.size:  # the same light, cut nearer to its rim
                 centres[known[0]], sizes[known[0]] = centre, size
                 owner[box][own] = known[0]
             elif len(centres) < _MAX_CANDIDATES:
@@ -291,7 +296,7 @@ def paper_filter(picture: Picture, *, limits: PaperLimits = _DEFAULT_LIMITS) -> 
     area = np.array([r[2] for r in unique])
     M = np.array([r[3] for r in unique])
     det = np.linalg.det(M)
-    # A rim pixel is in or out: its share errs by a uniform +-1/2, and the rim has about 2 sqrt(pi area) pixels.
+    # A rim pixel is in or out: its share errs by a uniform +-1/2; the rim has about 2 sqrt(pi area) pixels.
     share_var = 2 * np.sqrt(np.pi * area) / 12
     cov = 2 * M * (share_var / area**2)[:, None, None] + FLOOR_SD_PX**2 * np.eye(2)
     return Blobs(
@@ -319,7 +324,8 @@ def _paper_mask(picture: Picture, box: tuple[int, int, int, int], limits: PaperL
     blue = np.clip(y + 1.772 * cb, 0, 255)
     grey = 0.299 * red + 0.587 * green + 0.114 * blue
     lowest = np.minimum(np.minimum(red, green), blue)
-    return ((lowest >= limits.channel_min) & (grey > limits.grey_min)).astype(np.uint8)
+    passes = (lowest >= limits.channel_min) & (grey > limits.grey_min)
+    return np.asarray(passes, dtype=np.uint8)
 
 
 def _paper_regions(
