@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_common.camera_model import SensorMode
+from bricktrack_common.camera_model import IMX219_1080P, SensorMode
 from bricktrack_common.errors import ConfigError, RunFormatError, VideoError
 from bricktrack_common.typed_data import convert, load_toml
 
@@ -277,7 +277,18 @@ def sensor_mode(
     binning: int = 1,
     row_order: Literal["down", "up"] = "down",
 ) -> SensorMode:
-    """Return a sensor mode; an unknown crop is taken to be the picture itself, from the sensor's corner."""
+    """Return a sensor mode from what is known of it.
+
+    Where the crop is not known, a picture of 1920 x 1080 is taken for the IMX219's centre crop, as
+    ``bricktrack calibrate`` does; any other for the sensor read from its corner.
+    """
+    known = IMX219_1080P
+    if crop_width is None and crop_height is None and (width, height, binning) == (
+        known.width, known.height, known.binning,
+    ):  # fmt: skip
+        return msgspec.structs.replace(
+            known, name=name or known.name, line_time_ns=line_time_us * 1000.0, row_order=row_order
+        )
     try:
         return msgspec.convert(
             {

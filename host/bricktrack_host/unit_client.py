@@ -109,6 +109,7 @@ class UnitClient:
         for option, value in (
             (zmq.IMMEDIATE, 1),
             (zmq.LINGER, 500),
+            (zmq.IPV6, 1),
             (zmq.HEARTBEAT_IVL, 2000),
             (zmq.HEARTBEAT_TIMEOUT, 6000),
             (zmq.HANDSHAKE_IVL, 5000),

@@ -41,7 +41,9 @@ Misbehaviour = Callable[[object, list[Message]], list[Message]]
 class FakeUnit:
     """Serves every run folder below ``runs``; ``misbehave`` may alter each answer."""
 
-    def __init__(self, runs: Path, *, name: str = "fake", misbehave: Misbehaviour | None = None, port: int = 0) -> None:
+    def __init__(
+        self, runs: Path, *, name: str = "fake", misbehave: Misbehaviour | None = None, port: int = 0
+    ) -> None:
         self.name = name
         self.runs = runs
         self.misbehave = misbehave or (lambda request, messages: messages)

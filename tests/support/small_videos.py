@@ -26,7 +26,12 @@ def pictures(n: int) -> list[np.ndarray]:
 
 
 def write_video(
-    path: Path, n: int, *, gop: int = 10, stamps_us: list[int] | None = None, options: dict[str, str] | None = None
+    path: Path,
+    n: int,
+    *,
+    gop: int = 10,
+    stamps_us: list[int] | None = None,
+    options: dict[str, str] | None = None,
 ) -> None:
     """Encode ``n`` pictures; ``.h264`` gives a bare stream, ``.mp4`` and ``.mkv`` keep the stamps."""
     container = av.open(str(path), "w", format="h264" if path.suffix == ".h264" else None)

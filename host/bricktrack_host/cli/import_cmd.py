@@ -1,11 +1,15 @@
 """``bricktrack import``."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
+import msgspec
 import typer
 
+from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import ConfigError
+from bricktrack_common.typed_data import load_toml
 from bricktrack_host.cli._console import err, out
 from bricktrack_host.loose_files import LooseRig, read_rig, sensor_mode
 
@@ -66,6 +70,17 @@ def import_recording(
             "--rig-table", help="Its table of this video, as motion or static.", rich_help_panel=_RIG
         ),
     ] = "motion",
+    sensor_mode_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--sensor-mode",
+            help="TOML file with the sensor mode, where it is not the IMX219's 1920 x 1080 crop.",
+            exists=True,
+            dir_okay=False,
+            show_default=False,
+            rich_help_panel=_RIG,
+        ),
+    ] = None,
     exposure_us: Annotated[
         int | None,
         typer.Option("--exposure-us", min=1, help="Exposure time.", show_default=False, rich_help_panel=_RIG),
@@ -166,6 +181,11 @@ def import_recording(
             raise ConfigError(f"how the sensor was read is not known: give --rig, or {', '.join(lacking)}")
         mode = sensor_mode(width=width, height=height, line_time_us=line_time_us)
         loose = LooseRig(mode, exposure_us, first_sensor_timestamp_ns)
+    if sensor_mode_file is not None:
+        # The line time stays as the rig or the options say it: 0 for a picture without rolling shutter.
+        full = load_toml(sensor_mode_file, SensorMode)
+        full = msgspec.structs.replace(full, line_time_ns=loose.mode.line_time_ns)
+        loose = dataclasses.replace(loose, mode=full)
     made = make_run(
         Recording(
             video=video,

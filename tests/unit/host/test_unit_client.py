@@ -1,0 +1,224 @@
+"""The protocol client against a unit in a thread that keeps to the protocol, and one that does not."""
+
+import threading
+import time
+
+import msgpack
+import pytest
+from fake_unit import FakeUnit
+from run_folders import make_run
+
+from bricktrack_common.errors import ProtocolError, TransferError, UnitError, UnitTimeoutError
+from bricktrack_common.wire_messages import (
+    Confirmed,
+    Disarmed,
+    GetStatus,
+    Read,
+    Refusal,
+    encode_message,
+)
+from bricktrack_host.unit_client import Stopped, UnitClient
+
+RUN = "fake_0001_shake"
+
+
+@pytest.fixture
+def runs(tmp_path):
+    make_run(tmp_path, RUN, {"video.h264": 100_000, "frames.msgpack": 10})
+    return tmp_path
+
+
+def whole_file(client, *, chunk_bytes=1000, n_bytes=100_000):
+    ranges = [(o, min(chunk_bytes, n_bytes - o)) for o in range(0, n_bytes, chunk_bytes)]
+    out = bytearray(n_bytes)
+    for offset, data in client.read_chunks(RUN, 1, ranges):
+        out[offset : offset + len(data)] = data
+    return bytes(out)
+
+
+def once(when, change):
+    """Misbehave at the first request for which ``when`` holds."""
+    done = []
+
+    def misbehave(request, messages):
+        if not done and when(request):
+            done.append(True)
+            return change(messages)
+        return messages
+
+    return misbehave
+
+
+def is_read_at(offset):
+    return lambda request: isinstance(request, Read) and request.offset == offset
+
+
+def test_each_request_gets_its_reply(runs):
+    with FakeUnit(runs) as unit, UnitClient(unit.address) as client:
+        assert client.hello().unit == "fake"
+        assert client.status().runs == 1
+        assert client.arm("shake", duration_s=3.0).run_id == RUN
+        assert isinstance(client.disarm(), Disarmed)
+        assert [r.run_id for r in client.list_runs().runs] == [RUN]
+        description = client.describe_run(RUN)
+        assert [f.name for f in description.files] == ["manifest.json", "video.h264", "frames.msgpack"]
+        assert isinstance(client.confirm(RUN, [f.sha256 for f in description.files]), Confirmed)
+
+
+def test_chunks_are_asked_for_ahead_and_make_up_the_file(runs):
+    with FakeUnit(runs) as unit, UnitClient(unit.address) as client:
+        assert whole_file(client) == (runs / RUN / "video.h264").read_bytes()
+        assert len(unit.reads()) == 100
+        chunks = client.read_chunks(RUN, 1, [(o, 1000) for o in range(0, 100_000, 1000)], credit=10)
+        next(chunks)
+        # One was taken, nine are still out: the credit is not exceeded while the receiver is at work.
+        deadline = time.monotonic() + 5
+        while len(unit.reads()) < 110 and time.monotonic() < deadline:
+            threading.Event().wait(0.005)
+        assert len(unit.reads()) == 110
+
+
+def test_duplicated_and_late_replies_are_counted_and_ignored(runs):
+    held = []
+
+    def misbehave(request, messages):
+        if isinstance(request, GetStatus) and not held:
+            held.extend(messages)
+            return []  # comes late, behind the next answer
+        return [*messages, *held, *messages]
+
+    with FakeUnit(runs, misbehave=misbehave) as unit, UnitClient(unit.address, timeout_s=0.3) as client:
+        with pytest.raises(UnitTimeoutError):
+            client.status()
+        assert client.hello().unit == "fake"
+        assert whole_file(client) == (runs / RUN / "video.h264").read_bytes()
+        assert client.counts.stray_replies >= 2
+
+
+def test_foreign_bytes_are_counted_and_ignored(runs):
+    junk = [[b"GET / HTTP/1.1\r\n"], [b""], [msgpack.packb({"protocol": 1})], [b"\xc1", b"x"]]
+    with (
+        FakeUnit(runs, misbehave=lambda request, messages: [*junk, *messages]) as unit,
+        UnitClient(unit.address) as client,
+    ):
+        assert client.hello().unit == "fake"
+        assert client.counts.foreign_messages == len(junk)
+
+
+def test_only_foreign_bytes_end_in_a_timeout_that_says_so(runs):
+    with (
+        FakeUnit(runs, misbehave=lambda request, messages: [[b"SSH-2.0-OpenSSH"]]) as unit,
+        UnitClient(unit.address, timeout_s=0.3) as client,
+        pytest.raises(UnitTimeoutError, match="1 messages came that are not bricktrack's"),
+    ):
+        client.hello()
+
+
+def test_a_silent_address_times_out_with_words():
+    with (
+        UnitClient("tcp://127.0.0.1:9", timeout_s=0.2) as client,
+        pytest.raises(UnitTimeoutError, match="no connection in time"),
+    ):
+        client.hello()
+
+
+def test_another_protocol_version_is_named(runs):
+    def newer(request, messages):
+        envelope = msgpack.unpackb(messages[0][0]) | {"protocol": 2}
+        return [[msgpack.packb(envelope)]]
+
+    with (
+        FakeUnit(runs, misbehave=newer) as unit,
+        UnitClient(unit.address) as client,
+        pytest.raises(ProtocolError, match="version 2.*same bricktrack on both ends"),
+    ):
+        client.hello()
+
+
+def test_a_refusal_carries_code_and_words(runs):
+    def refuse(request, messages):
+        request_id = msgpack.unpackb(messages[0][0])["request_id"]
+        return [[encode_message(request_id, Refusal(code="busy", message="recording"))]]
+
+    with FakeUnit(runs, misbehave=refuse) as unit, UnitClient(unit.address) as client:
+        with pytest.raises(UnitError, match="recording") as refused:
+            client.list_runs()
+        assert refused.value.code == "busy"
+
+
+def test_an_answer_of_the_wrong_kind_is_a_protocol_error(runs):
+    def confuse(request, messages):
+        request_id = msgpack.unpackb(messages[0][0])["request_id"]
+        return [[encode_message(request_id, Disarmed())]]
+
+    with (
+        FakeUnit(runs, misbehave=confuse) as unit,
+        UnitClient(unit.address) as client,
+        pytest.raises(ProtocolError, match="answered hello with a Disarmed"),
+    ):
+        client.hello()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: [[m[0][0], bytes([m[0][1][0] ^ 1]) + m[0][1][1:]]],
+        lambda m: [[m[0][0], m[0][1][:-1]]],
+        lambda m: [],
+    ],
+    ids=["broken checksum", "cut short", "never sent"],
+)
+def test_a_bad_or_missing_chunk_is_asked_for_again(runs, change):
+    with (
+        FakeUnit(runs, misbehave=once(is_read_at(5000), change)) as unit,
+        UnitClient(unit.address) as client,
+    ):
+        assert whole_file(client) == (runs / RUN / "video.h264").read_bytes()
+        assert client.counts.repeated_chunks == 1
+        assert sum(r.offset == 5000 for r in unit.reads()) == 2
+
+
+def test_a_chunk_of_another_place_is_not_taken(runs):
+    """The reply has the right number but says another offset: bytes would land in the wrong place."""
+    other = []
+
+    def misbehave(request, messages):
+        if isinstance(request, Read) and request.offset == 4000:
+            other.append(messages[0])
+        if isinstance(request, Read) and request.offset == 5000 and len(other) == 1:
+            envelope = msgpack.unpackb(other[0][0])
+            envelope["request_id"] = msgpack.unpackb(messages[0][0])["request_id"]
+            other.append([])
+            return [[msgpack.packb(envelope), other[0][1]]]
+        return messages
+
+    with FakeUnit(runs, misbehave=misbehave) as unit, UnitClient(unit.address) as client:
+        assert whole_file(client) == (runs / RUN / "video.h264").read_bytes()
+        assert client.counts.repeated_chunks == 1
+
+
+def test_a_chunk_that_stays_broken_ends_the_transfer(runs):
+    def always(request, messages):
+        if is_read_at(5000)(request):
+            return [[messages[0][0], b"\0" * len(messages[0][1])]]
+        return messages
+
+    with (
+        FakeUnit(runs, misbehave=always) as unit,
+        UnitClient(unit.address) as client,
+        pytest.raises(TransferError, match="does not match its checksum, 4 times"),
+    ):
+        whole_file(client)
+
+
+def test_waiting_ends_when_told_to_stop(runs):
+    stop = threading.Event()
+    with (
+        FakeUnit(runs, misbehave=lambda request, messages: []) as unit,
+        UnitClient(unit.address, timeout_s=30, stop=stop) as client,
+    ):
+        threading.Timer(0.1, stop.set).start()
+        began = time.monotonic()
+        with pytest.raises(Stopped):
+            client.hello()
+        assert time.monotonic() - began < 5

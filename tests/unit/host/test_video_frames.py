@@ -1,0 +1,188 @@
+"""Every picture stands with its own record, whatever happens to its neighbours."""
+
+import numpy as np
+import pytest
+from small_videos import HEIGHT, PERIOD_US, WIDTH, grey_of, write_video
+
+from bricktrack_common.errors import VideoError
+from bricktrack_common.frame_times import FrameTimes
+from bricktrack_host.annex_b import split_access_units
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.video_frames import decode_run_video
+
+N, GOP = 32, 8
+MEAN_TOLERANCE = 3  # grey levels; CRF 18 errs by less than one, neighbours differ by 37
+
+
+def frame_times(path):
+    units = split_access_units(path.read_bytes())
+    i = np.arange(len(units))
+    return FrameTimes(
+        pts_us=i * PERIOD_US, sensor_timestamp_ns=10**12 + i * PERIOD_US * 1000, exposure_us=np.full(len(i), 4000),
+        analogue_gain=np.ones(len(i)), keyframe=np.array([u.keyframe for u in units]),
+        byte_offset=np.array([u.byte_offset for u in units]), n_bytes=np.array([u.n_bytes for u in units]),
+        flags=np.zeros(len(i), np.int64), leftover_bytes=0,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def video(tmp_path):
+    path = tmp_path / "video.h264"
+    write_video(path, N, gop=GOP)
+    return path, frame_times(path)
+
+
+def check(path, frames, *, threads=2):
+    """Decode; make sure that every picture is the one its index says; return the lost ones with reasons."""
+    lost = {}
+    indices = []
+    for frame in decode_run_video(path, frames, threads=threads):
+        indices.append(frame.index)
+        assert frame.sensor_timestamp_ns == frames.sensor_timestamp_ns[frame.index]
+        if frame.picture is None:
+            assert frame.flags == PoseFlag.FRAME_LOST
+            lost[frame.index] = frame.lost_because
+        else:
+            assert frame.flags == 0
+            assert frame.lost_because == ""
+            assert abs(float(frame.picture.luma.mean()) - grey_of(frame.index)) < MEAN_TOLERANCE
+    assert indices == list(range(frames.n_frames))
+    return lost
+
+
+def damage(path, frames, i, change):
+    data = bytearray(path.read_bytes())
+    start, n = int(frames.byte_offset[i]), int(frames.n_bytes[i])
+    data[start : start + n] = change(bytes(data[start : start + n]))
+    path.write_bytes(data)
+
+
+def until_keyframe(i):
+    return list(range(i, (i // GOP + 1) * GOP))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_a_sound_video_gives_every_picture(video, threads):
+    assert check(*video, threads=threads) == {}
+
+
+def test_planes_are_read_only_views_of_the_pictures_size(video):
+    frame = next(decode_run_video(*video))
+    planes = (frame.picture.luma, frame.picture.chroma_u, frame.picture.chroma_v)
+    assert [p.shape for p in planes] == [
+        (HEIGHT, WIDTH),
+        (HEIGHT // 2, WIDTH // 2),
+        (HEIGHT // 2, WIDTH // 2),
+    ]
+    assert not any(p.flags.owndata or p.flags.writeable for p in planes)
+    assert abs(int(planes[1].mean()) - 128) <= 1
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda b: b[:40] + bytes(len(b) - 40),
+        lambda b: b[:60] + bytes(x ^ 0x55 for x in b[60:]),
+        lambda b: bytes(len(b)),
+        lambda b: b"\xff" * len(b),
+    ],
+    ids=["tail blank", "tail flipped", "all blank", "all ones"],
+)
+def test_a_damaged_picture_is_lost_with_all_that_is_predicted_from_it(video, change, threads):
+    path, frames = video
+    damage(path, frames, 11, change)
+    lost = check(path, frames, threads=threads)
+    assert list(lost) == until_keyframe(11)
+    assert "damaged" in lost[11]
+    assert lost[12] == "predicted from frame 11, which is lost"
+
+
+def test_a_damaged_keyframe_loses_its_group_only(video):
+    path, frames = video
+    damage(path, frames, 8, lambda b: b[:60] + bytes(len(b) - 60))
+    assert list(check(path, frames)) == until_keyframe(8)
+
+
+def test_damage_in_the_last_picture_loses_it_alone(video):
+    path, frames = video
+    damage(path, frames, N - 1, lambda b: bytes(len(b)))
+    assert list(check(path, frames)) == [N - 1]
+
+
+def test_a_video_cut_in_the_middle_of_a_picture_ends_there(video):
+    path, frames = video
+    cut = int(frames.byte_offset[20]) + 30
+    path.write_bytes(path.read_bytes()[:cut])
+    lost = check(path, frames)
+    assert list(lost) == list(range(20, N))
+    assert lost[20] == f"the video file ends at byte {cut}, before this frame does"
+
+
+def test_a_picture_that_never_was_written_loses_what_is_predicted_from_it(video):
+    """The decoder would invent it and say nothing."""
+    path, frames = video
+    data = path.read_bytes()
+    keep = [i for i in range(N) if i != 12]
+    path.write_bytes(
+        b"".join(data[frames.byte_offset[i] : frames.byte_offset[i] + frames.n_bytes[i]] for i in keep)
+    )
+    shorter = frame_times(path)
+    lost = {f.index: f.lost_because for f in decode_run_video(path, shorter) if f.picture is None}
+    assert list(lost) == [12, 13, 14]  # pictures 13, 14 and 15 of the scene
+    assert lost[12] == "a picture that it is predicted from is not in the file"
+
+
+def test_a_video_that_begins_without_a_keyframe_starts_at_the_next(video):
+    path, frames = video
+    path.write_bytes(path.read_bytes()[frames.byte_offset[3] :])
+    lost = [f.index for f in decode_run_video(path, frame_times(path)) if f.picture is None]
+    assert lost == list(range(GOP - 3))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_damage_ever_puts_a_picture_at_a_wrong_time(video, seed):
+    """Random bytes at random places: what is not lost must look like its own picture and no other."""
+    path, frames = video
+    draw = np.random.default_rng(seed)
+    data = bytearray(path.read_bytes())
+    for _ in range(int(draw.integers(1, 8))):
+        at, n = int(draw.integers(len(data) - 40)), int(draw.integers(4, 40))
+        data[at : at + n] = draw.bytes(n)
+    path.write_bytes(data)
+    check(path, frames)
+
+
+@pytest.mark.parametrize(
+    ("x264", "expected"),
+    [
+        ("fullrange=on", "full"),
+        ("fullrange=off:colorprim=smpte170m", "limited"),
+        ("fullrange=off", "unknown"),
+    ],
+)
+def test_the_range_is_stated_as_the_stream_says_it(tmp_path, x264, expected):
+    path = tmp_path / "video.h264"
+    write_video(path, 2, options={"x264-params": x264})
+    assert {f.color_range for f in decode_run_video(path, frame_times(path))} == {expected}
+
+
+def test_b_pictures_are_refused(tmp_path):
+    path = tmp_path / "video.h264"
+    write_video(path, 30, options={"bf": "2", "b_strategy": "0"})
+    with pytest.raises(VideoError, match=r"B pictures.*ffmpeg"):
+        list(decode_run_video(path, frame_times(path)))
+
+
+def test_a_missing_and_an_empty_file_are_video_errors(tmp_path, video):
+    with pytest.raises(VideoError, match="No such file"):
+        list(decode_run_video(tmp_path / "none.h264", video[1]))
+    (tmp_path / "empty.h264").touch()
+    with pytest.raises(VideoError, match="empty"):
+        list(decode_run_video(tmp_path / "empty.h264", video[1]))
+
+
+def test_leaving_early_closes_the_file(video):
+    frames = decode_run_video(*video)
+    assert next(frames).index == 0
+    frames.close()
