@@ -39,9 +39,9 @@ def sample_motion(
 ) -> FusedTrack:
     """Return the motion of run ``b`` of a batch at instants of camera time.
 
-    From the node before, the inertial samples carry the state to the instant, so what happened between nodes is
-    kept. Where that path misses the node after (it does where the samples are not believed), the miss is spread
-    as white noise would: attitude linearly, velocity and position along the cubic that joins both ends.
+    From the node before, the inertial samples carry the state to the instant, so what happened between nodes
+    is kept. Where that path misses the node after (it does where the samples are not believed), the miss is
+    spread as white noise would: attitude linearly, velocity and position along the cubic that joins both ends.
     A filter's state (``is_smoothed`` false) knows nothing of the node after and is only carried on.
     """
     n = len(nodes.t_s)
@@ -89,6 +89,8 @@ def sample_motion(
     R_out, p_out, H = observe(state, omega, run.lever_arm_m, t_cam - run.t_mid_s, zero)
     P = H @ cov @ np.swapaxes(H, 1, 2)
     _add_bridge(P, problem, k, b, dt, nodes, is_smoothed=is_smoothed)
+    # Errors that the frames have in common: the median frame stands for all.
+    P = P + settings.optical_common_share**2 * np.median(problem.cov_seen[nodes.node_of_frame, b], axis=0)
     v_out = v - np.einsum("nij,nj->ni", R_t, np.cross(omega, run.lever_arm_m))
 
     P = 0.5 * (P + np.swapaxes(P, 1, 2))
@@ -151,10 +153,13 @@ def _flags(
     period = float(np.median(np.diff(run.t_cam_s))) if len(run.t_cam_s) > 1 else np.inf
     away = np.minimum(np.abs(t_cam - frames[other]), np.abs(t_cam - frames[i - 1]))
     slack = 1e-6
+    rough = signal.acc_roughness_mps2
+    # A steady vibration is no impact: what counts stands out of the run.
+    limit = max(settings.impact_mps2, 4 * float(np.median(rough)))
     marks = {
         PoseFlag.DROPOUT: away > 1.5 * period,
         PoseFlag.EXTRAPOLATED: (t_cam < frames[0] - slack) | (t_cam > frames[-1] + slack),
-        PoseFlag.IMPACT: _near_sample(signal, t_imu, signal.acc_roughness_mps2 > settings.impact_mps2),
+        PoseFlag.IMPACT: _near_sample(signal, t_imu, rough > limit),
         PoseFlag.CLIPPED: _near_sample(signal, t_imu, signal.clip_sd_mps2 > 0),
         PoseFlag.IMU_GAP: signal.in_gap(t_imu),
     }

@@ -1,7 +1,7 @@
 """Camera and IMU together: the motion of the brick at any instants, with covariance and flags.
 
-The camera is static and one IMU rides in the brick (DESIGN 8.2). `fuse` treats one run, `fuse_batch` many in one
-loop over time.
+The camera is static and one IMU rides in the brick (DESIGN 8.2). `fuse` treats one run, `fuse_batch` many in
+one loop over time.
 """
 
 import logging
@@ -19,9 +19,9 @@ from bricktrack_host.fused_output import sample_motion
 from bricktrack_host.fusion_problem import (
     FusionSettings,
     Linearisation,
+    Nodes,
     NoiseLevel,
     NoiseParts,
-    Nodes,
     Run,
     build_problem,
     first_linearisation,
@@ -188,8 +188,8 @@ def fuse_batch(
     """Return what `fuse` gives for each of many runs, in one loop over time for eight runs at once."""
     if camera != "static":
         raise ConfigError(
-            f"camera = {camera!r}: expected 'static'. When the camera moves, its own acceleration and gravity "
-            "cannot be told from the brick's with one IMU on the LED component: the position is not observable. "
+            f"camera = {camera!r}: expected 'static'. When the camera moves, one IMU on the LED component cannot "
+            "tell the camera's acceleration from the brick's: the relative position is not observable. "
             "Mount a second IMU with the camera, or smooth the optical poses alone (smooth_optical)."
         )
     settings = settings or FusionSettings()
@@ -270,40 +270,30 @@ def _frame_chi2(
     return chi2(slice(0, 3)), chi2(slice(3, 6)), chi2(slice(0, 6))
 
 
-def _choices(settings: FusionSettings) -> tuple[list[NoiseLevel], FloatArray]:
-    """Return the noise levels that a run may choose from, the stated one first, and what each must earn."""
-    steps = [(i, j) for i in (0, -1, -2) for j in (0, 1, 2)]
-    levels = [NoiseLevel(settings.roughness_share * _LEVEL_STEP**i, _LEVEL_STEP**j) for i, j in steps]
-    return levels, np.array([_EARN_PER_STEP * (abs(i) + abs(j)) for i, j in steps])
-
-
 def _choose_noise(
     problem: Problem, parts: list[NoiseParts], settings: FusionSettings
 ) -> list[tuple[NoiseLevel, NoiseLevel]]:
     """Return the noise levels of gyro and accelerometer under which each run's frames are likeliest.
 
-    First the gyro's, then the accelerometer's: all choices of all runs as one batch.
+    The roughness of the accelerometer may count for less than stated, the systematic errors of both sensors
+    for more: all choices of all runs as one batch. The stated level stands unless others earn their difference.
     """
-    levels, price = _choices(settings)
-    n_runs, n = len(parts), len(levels)
-
-    def best(gyro: FloatArray, acc: FloatArray) -> IntArray:
-        likelihood = Filter(problem.with_noise_choices(gyro, acc), keep=False).log_likelihood
-        return np.argmax(likelihood.reshape(n_runs, n) - price, axis=1)
-
-    gyro = np.repeat(problem.gyro_var[..., None], n, axis=2)
-    acc = np.repeat(problem.acc_var[..., None], n, axis=2)
-    trial = gyro.copy()
+    steps = [(i, j) for i in (0, -1, -2) for j in (0, 1, 2)]
+    price = np.array([_EARN_PER_STEP * (abs(i) + abs(j)) for i, j in steps])
+    share = settings.roughness_share
+    levels = [
+        (NoiseLevel(share, _LEVEL_STEP**j), NoiseLevel(share * _LEVEL_STEP**i, _LEVEL_STEP**j))
+        for i, j in steps
+    ]
+    gyro = np.repeat(problem.gyro_var[..., None], len(levels), axis=2)
+    acc = np.repeat(problem.acc_var[..., None], len(levels), axis=2)
     for b, part in enumerate(parts):
-        for i, level in enumerate(levels):
-            trial[: len(part.gyro_fixed), b, i] = part.gyro(level)
-    of_gyro = best(trial, acc)
-    for b, part in enumerate(parts):
-        gyro[: len(part.gyro_fixed), b] = part.gyro(levels[of_gyro[b]])[:, None]
-        for i, level in enumerate(levels):
-            acc[: len(part.acc_fixed), b, i] = part.acc(level)
-    of_acc = best(gyro, acc)
-    return [(levels[g], levels[a]) for g, a in zip(of_gyro, of_acc, strict=True)]
+        for i, (of_gyro, of_acc) in enumerate(levels):
+            gyro[: len(part.gyro_fixed), b, i] = part.gyro(of_gyro)
+            acc[: len(part.acc_fixed), b, i] = part.acc(of_acc)
+    likelihood = Filter(problem.with_noise_choices(gyro, acc), keep=False).log_likelihood
+    best = np.argmax(likelihood.reshape(len(parts), len(levels)) - price, axis=1)
+    return [levels[i] for i in best]
 
 
 def _fuse_together(

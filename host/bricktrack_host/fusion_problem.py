@@ -46,6 +46,9 @@ class FusionSettings:
         A measured alignment enters no tighter than this, nor than twice its own sd.
     acc_lag_ns, acc_lag_sd_ns : float, ns
         Accelerometer minus gyro low-pass lag, and how well it is known; BNO055 default bandwidths: -3.4 ms.
+    optical_common_share : float
+        Part of the optical sd that neighbouring frames have in common (LED profile, calibration, pixel grid)
+        and that no averaging over frames takes away. It is added to the covariance that is given out.
     gate_chi2 : float
         A frame whose residual to all the others, squared over its covariance, exceeds this is left out
         (6 degrees of freedom; 33 is passed by all but one in 100 000).
@@ -72,6 +75,7 @@ class FusionSettings:
     offset_prior_sd_ns: float = 0.3e6
     acc_lag_ns: float = 0.0
     acc_lag_sd_ns: float = 4e6
+    optical_common_share: float = 0.3
     gate_chi2: float = 33.0
     impact_mps2: float = 3.0
     max_position_sd_mm: float = 50.0
@@ -221,8 +225,8 @@ class NoiseParts:
     Attributes
     ----------
     gyro_fixed, acc_fixed
-        White noise of the samples, clipping, and gaps, where the signal is only bridged and its whole spread is
-        the error.
+        White noise of the samples, clipping, and gaps, where the signal is only bridged and its whole spread
+        is the error.
     gyro_rough, acc_rough
         Motion faster than the samples follow, at a share of 1.
     gyro_systematic, acc_systematic
@@ -239,7 +243,9 @@ class NoiseParts:
     def gyro(self, level: "NoiseLevel") -> FloatArray:
         """Return the whole density for one level."""
         return np.asarray(
-            self.gyro_fixed + level.roughness**2 * self.gyro_rough + level.systematic**2 * self.gyro_systematic
+            self.gyro_fixed
+            + level.roughness**2 * self.gyro_rough
+            + level.systematic**2 * self.gyro_systematic
         )
 
     def acc(self, level: "NoiseLevel") -> FloatArray:

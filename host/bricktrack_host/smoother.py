@@ -1,9 +1,10 @@
 """Error-state Kalman filter on the manifold with a fixed-interval smoother, for a batch of runs at once.
 
-The equations are DESIGN 8.2's. SI units inside. Error state, 21 components: attitude (body axes), position and
-velocity of the IMU point (camera axes), gyro and accelerometer bias, gravity (camera axes), time offset, clock
-skew, accelerometer-minus-gyro lag. Arrays put time first and the runs of the batch second, so that each step of
-the one loop over time works on contiguous memory; a run shorter than the others is padded with empty steps.
+The equations are DESIGN 8.2's. SI units inside. Error state, 21 components: attitude (body axes), position
+and velocity of the IMU point (camera axes), gyro and accelerometer bias, gravity (camera axes), time offset,
+clock skew, accelerometer-minus-gyro lag. Arrays put time first and the runs of the batch second, so that each
+step of the one loop over time works on contiguous memory; a run shorter than the others is padded with empty
+steps.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -17,7 +18,7 @@ N_STATES = 21
 N_MOVING = 9  # attitude, position, velocity: the others stand still or wander
 ATT, POS, VEL, BG, BA, GRAV = (slice(3 * i, 3 * i + 3) for i in range(6))
 TAU, SKEW, LAG = 18, 19, 20
-_STUDENT = 10.0
+_NIS_CAP = 100.0  # so that an outlier does not choose the noise
 CHI2_6_95 = 12.59  # 95 % point of chi-square with 6 degrees of freedom
 
 
@@ -74,7 +75,6 @@ class Problem:
     lag_lin: FloatArray
     start: "State"
     P_start: FloatArray
-
 
     def with_noise_choices(self, gyro_var: FloatArray, acc_var: FloatArray) -> "Problem":
         """Return a batch in which each run stands once for each choice of noise, choices running fastest.
@@ -232,7 +232,7 @@ class Filter:
     nis : ndarray, shape (K, B)
         Innovation squared over its covariance, NaN where no frame.
     log_likelihood : ndarray, shape (B,)
-        Of the frames given the past, by a Student t of 10 degrees of freedom that outliers cannot rule.
+        Of the frames given the past; what one frame can take away is bounded.
     """
 
     def __init__(self, problem: Problem, *, keep: bool = True) -> None:
@@ -313,7 +313,7 @@ class Filter:
         nis = (y * np.linalg.solve(S, y[..., None])[..., 0]).sum(axis=1)
         self.nis[k, runs] = nis
         log_det = np.linalg.slogdet(S)[1]
-        self.log_likelihood[runs] -= 0.5 * (log_det + (_STUDENT + 6) * np.log1p(nis / _STUDENT))
+        self.log_likelihood[runs] -= 0.5 * (log_det + np.minimum(nis, _NIS_CAP))
         # A frame beyond what S allows is believed less, in proportion: never refused, so that the filter
         # finds back after it has gone wrong itself. The second pass judges with hindsight.
         inflate = np.maximum(nis / CHI2_6_95, 1.0)[:, None, None]
