@@ -1,0 +1,238 @@
+"""``bricktrack process`` and ``bricktrack report``: runs into results, and results into a page."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from bricktrack_common.errors import BricktrackError, ConfigError
+from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
+from bricktrack_host.cli._console import err, out, say_error
+from bricktrack_host.cli._errors import EXIT_ERROR
+from bricktrack_host.cli._units import DEFAULT_FLEET, FleetOption
+from bricktrack_host.fleet_config import UnitConfig, load_fleet
+from bricktrack_host.pipeline import (
+    REPORT_NAME,
+    RESULTS_FOLDER,
+    ProcessedRun,
+    ProcessSettings,
+    find_truth,
+    process_run,
+)
+from bricktrack_host.pull import PulledRun
+from bricktrack_host.report import ReportExtras, write_report
+from bricktrack_host.results import read_result
+from bricktrack_host.run_summary import key_figures, verdict
+from bricktrack_host.true_motion import read_true_motion
+from bricktrack_host.truth import TruthComparison, compare_with_truth, comparison_table
+
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option("--calibration", "-c", help="Calibration file of this unit. \\[default: the fleet file's]"),
+]
+LayoutOption = Annotated[
+    Path | None,
+    typer.Option("--layout", "-l", help="Layout file of the brick. \\[default: the fleet file's]"),
+]
+TruthOption = Annotated[
+    Path | None,
+    typer.Option("--truth", help="True motion of a simulated run: a file, or a folder that holds one."),
+]
+
+
+class _StageBar:
+    """One bar that shows the stage under way and how far it is."""
+
+    def __init__(self, progress: Progress, run_id: str) -> None:
+        self._progress = progress
+        self._run_id = run_id
+        self._task: TaskID = progress.add_task(run_id, total=None)
+
+    def stage(self, name: str, total: int | None) -> None:
+        self._progress.reset(self._task, total=total, description=f"{self._run_id}: {name}")
+
+    def advance_to(self, done: int) -> None:
+        self._progress.update(self._task, completed=done)
+
+
+@contextmanager
+def stage_bar(run_id: str) -> Iterator[_StageBar]:
+    """Show the progress of one run on the terminal while the block runs."""
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err, transient=True) as progress:
+        yield _StageBar(progress, run_id)
+
+
+def process(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders, as pulled or imported.")],
+    calibration: CalibrationOption = None,
+    layout: LayoutOption = None,
+    fleet: FleetOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for the results of one run. \\[default: RUN/results]"),
+    ] = None,
+    truth: TruthOption = None,
+    segmentation: Annotated[
+        Literal["default", "paper"],
+        typer.Option(help="Grey-weighted centroids, or the paper's thresholds and plain means."),
+    ] = "default",
+    printed_form: Annotated[
+        bool, typer.Option("--printed-form", help="PRSOI as printed in the paper, for comparison.")
+    ] = False,
+    rolling_shutter: Annotated[bool, typer.Option(help="Take each LED at the time of its own row.")] = True,
+    imu: Annotated[
+        str | None, typer.Option(help="Inertial sensor on the LED component. \\[default: the first]")
+    ] = None,
+    use_imu: Annotated[
+        bool, typer.Option("--use-imu/--no-imu", help="Fuse with the IMU, or smooth the optical poses alone.")
+    ] = True,
+) -> None:
+    """Turn recordings into motion: poses, tables (Parquet and CSV) and a report in each run's folder.
+
+    A run processed again gives the same numbers. Exits with 1 if a run could not be processed.
+
+    For example:
+
+        bricktrack process runs/b2_9f31c2_0007_shake --calibration b2.json --layout brick.toml
+
+        bricktrack process runs/b2_* --fleet fleet.toml
+    """
+    if output is not None and len(runs) > 1:
+        raise ConfigError(
+            f"--output is for one run; {len(runs)} were given. Leave it out: each has its own folder"
+        )
+    settings = ProcessSettings(
+        segmentation=segmentation,
+        prsoi_form="printed" if printed_form else "safe",
+        rolling_shutter=rolling_shutter,
+        imu=imu,
+        use_imu=use_imu,
+    )
+    failed = 0
+    for run in runs:
+        try:
+            unit_files = _files_for(run, calibration, layout, fleet)
+            with stage_bar(run.name) as bar:
+                processed = process_run(
+                    run, calibration=unit_files[0], layout=unit_files[1], output=output, settings=settings,
+                    truth=truth, progress=bar,
+                )  # fmt: skip
+        except BricktrackError as e:
+            if len(runs) == 1:
+                raise
+            say_error(f"{run}: {e}")
+            failed += 1
+            continue
+        say_processed(processed)
+    if failed:
+        say_error(f"{failed} of {len(runs)} runs could not be processed")
+        raise typer.Exit(EXIT_ERROR)
+
+
+def process_pulled(unit: UnitConfig, pulled: PulledRun) -> None:
+    """Process one run that was just pulled, with the calibration and layout that the fleet file names."""
+    if unit.calibration_path is None or unit.layout_path is None:
+        raise ConfigError(
+            f"fleet.toml names no calibration or no layout for unit '{unit.name}'. Add them, or "
+            f"process by hand: bricktrack process {pulled.folder} --calibration FILE --layout FILE"
+        )
+    if unit.camera != "static":
+        raise ConfigError(
+            f"unit '{unit.name}': camera = \"{unit.camera}\" in fleet.toml: with a moving camera and one "
+            "inertial sensor on the LEDs' side, the position cannot be told from the camera's own motion. "
+            "Process its optical poses alone: bricktrack process RUN --no-imu"
+        )
+    with stage_bar(pulled.run_id) as bar:
+        processed = process_run(
+            pulled.folder, calibration=unit.calibration_path, layout=unit.layout_path, progress=bar
+        )
+    say_processed(processed)
+
+
+def report(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A processed run, or its results folder.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The page to write. \\[default: RESULTS/report.html]"),
+    ] = None,
+    truth: TruthOption = None,
+) -> None:
+    """Write the report of a processed run again, and print what it amounts to.
+
+    For example:
+
+        bricktrack report runs/b2_9f31c2_0007_shake
+
+        bricktrack report runs/sample_motion --truth tests/data/path-traced/truth
+    """
+    folder = run / RESULTS_FOLDER if (run / MANIFEST_NAME).is_file() else run
+    result = read_result(folder)
+    path = find_truth(run, truth)
+    comparison = None if path is None else compare_with_truth(result, read_true_motion(path))
+    page = output or folder / REPORT_NAME
+    write_report(result, page, ReportExtras(truth=comparison))
+    line, problems = verdict(result, key_figures(result))
+    out.print(f"{result.manifest.run_id}: {line}", markup=False, soft_wrap=True)
+    for problem in problems:
+        out.print(f"  {problem}", style="yellow", markup=False, soft_wrap=True)
+    say_truth(comparison)
+    out.print(f"report: {page}", markup=False, soft_wrap=True)
+
+
+def _files_for(
+    run: Path, calibration: Path | None, layout: Path | None, fleet_file: Path | None
+) -> tuple[Path, Path]:
+    """Return the calibration and layout that the options name, or else the fleet file for the run's unit."""
+    if calibration is not None and layout is not None:
+        return calibration, layout
+    path = fleet_file or DEFAULT_FLEET
+    if fleet_file is None and not path.exists():
+        raise ConfigError("give --calibration and --layout, or a fleet file that names them for the unit")
+    unit = load_fleet(path).select([read_manifest(run / MANIFEST_NAME).unit])[0]
+    found = calibration or unit.calibration_path, layout or unit.layout_path
+    if found[0] is None or found[1] is None:
+        raise ConfigError(
+            f"{path}: unit '{unit.name}' has no {'calibration' if found[0] is None else 'layout'}"
+        )
+    return found[0], found[1]
+
+
+def say_processed(processed: ProcessedRun) -> None:
+    """Print the verdict, the errors against truth where there is one, the time budget and where it all is."""
+    result = processed.result
+    line, problems = verdict(result, key_figures(result))
+    out.print(f"{result.manifest.run_id}: {line}", markup=False, soft_wrap=True)
+    for problem in problems:
+        out.print(f"  {problem}", style="yellow", markup=False, soft_wrap=True)
+    say_truth(processed.truth)
+    table = Table(title="Time budget")
+    table.add_column("stage")
+    table.add_column("s", justify="right")
+    table.add_column("ms a frame", justify="right")
+    n_frames = len(result.optical.t_ns)
+    for name, seconds in result.timings_s.items():
+        table.add_row(name, f"{seconds:.2f}", f"{1000 * seconds / n_frames:.2f}")
+    total = sum(result.timings_s.values())
+    table.add_row("all", f"{total:.2f}", f"{1000 * total / n_frames:.2f}", style="bold")
+    out.print(table)
+    out.print(f"results: {processed.folder}", markup=False, soft_wrap=True)
+    out.print(f"report:  {processed.report}", markup=False, soft_wrap=True)
+
+
+def say_truth(comparison: TruthComparison | None) -> None:
+    """Print the errors against simulated truth, absolute and as displacements from rest."""
+    if comparison is None:
+        return
+    out.print(comparison_table(comparison))
+    if comparison.from_rest:
+        out.print(comparison_table(comparison, from_rest=True))
