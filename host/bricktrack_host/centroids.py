@@ -144,12 +144,12 @@ def measure_spot(
     share = (light - background) / (plateau - background)
     rows, columns = patch.shape
     cut = int(np.searchsorted(share, SEARCH_SHARE))
-    mask = cv2.threshold(patch, max(cut - 1, 0), 255, cv2.THRESH_BINARY)[1]
+    mask = np.asarray(cv2.threshold(patch, max(cut - 1, 0), 255, cv2.THRESH_BINARY)[1], dtype=np.uint8)
     u0, v0 = near_px if near_px is not None else (origin_px[0] + columns / 2, origin_px[1] + rows / 2)
     seed = _lit_pixel(mask, u0 - origin_px[0], v0 - origin_px[1])
     if seed is None:
         return None
-    _, mask, _, (x, y, w, h) = cv2.floodFill(mask, None, seed, _OWN, flags=8)
+    _, _, _, (x, y, w, h) = cv2.floodFill(mask, None, seed, _OWN, flags=8)
     touches = x == 0 or y == 0 or x + w == columns or y + h == rows
     # The soft rim reaches beyond the half-light line; three pixels hold it, and more where motion smears it.
     reach = 3 + max(w, h) // 12

@@ -19,6 +19,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_a
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
+from bricktrack_host.finite import all_finite
 from bricktrack_host.p3p import ray_centre_mm, rays_of, solve_p3p
 from bricktrack_host.prsoi import PrsoiForm, prsoi_poses
 from bricktrack_host.refine import RefinedPoses, refine_poses
@@ -104,7 +105,7 @@ def assign_predicted(
     """
     n_leds = len(predicted_px)
     none = np.full(n_leds, -1, dtype=np.int64)
-    known = np.flatnonzero(np.isfinite(predicted_px).all(axis=1))
+    known = np.flatnonzero(all_finite(predicted_px))
     if known.size == 0 or len(blobs_px) == 0:
         return none
     apart = blobs_px[None] - predicted_px[known][:, None]  # (leds, blobs, 2)
@@ -228,7 +229,7 @@ def verify(
     poses = refine_poses(uv, cov, R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=6)
     for last in (False, False, True):
         length = np.linalg.norm(poses.residual_px, axis=-1)
-        seen = np.isfinite(uv).all(axis=-1)
+        seen = all_finite(uv)
         bad = seen & ~((length <= gate_px) & (poses.facing > _MIN_FACING))
         rows = np.flatnonzero(bad.any(axis=1))
         if rows.size == 0:
@@ -250,7 +251,7 @@ def verify(
             max_steps=6,
         )
         poses = poses.replaced(rows, again)
-    kept = np.isfinite(uv).all(axis=-1)
+    kept = all_finite(uv)
     kept[kept.sum(axis=1) < MIN_INLIERS] = False
     return kept, poses
 
@@ -266,7 +267,7 @@ def prsoi_starts(
     """Return the PRSOI poses, (n, 3, 3) and (n, 3), of centroids (n, n_leds, 2), NaN where unseen."""
     a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
     on_a, on_b = np.full_like(uv_px, np.nan), np.full_like(uv_px, np.nan)
-    seen = np.isfinite(uv_px).all(axis=-1)
+    seen = all_finite(uv_px)
     on_a[seen] = ray_model.points_on_plane(uv_px[seen], a)
     on_b[seen] = ray_model.points_on_plane(uv_px[seen], b)
     found = prsoi_poses(on_a, on_b, brick_model.led_positions_mm, plane_a_mm=a, plane_b_mm=b, form=form)

@@ -24,6 +24,7 @@ from bricktrack_host.correspondence import (
     search_correspondence,
     verify,
 )
+from bricktrack_host.finite import all_finite
 from bricktrack_host.led_profile import predict_brick
 from bricktrack_host.refine import RefinedPoses
 from bricktrack_host.segment import Blobs
@@ -150,7 +151,7 @@ class _Run:
         uv = np.stack([_pixels(self._blobs[i], a) for i, a in proposals])
         R, t = prsoi_starts(uv, self._rays, self._brick)
         # Where PRSOI has no answer (LEDs in one plane) the anchor's pose is a start.
-        none = ~np.isfinite(R).all(axis=(1, 2))
+        none = ~all_finite(R, 2)
         R[none], t[none] = self.result.R_camera_brick[anchor], self.result.t_camera_brick_mm[anchor]
         kept, poses = self._verify(uv, (R, t))
         wrong = np.flatnonzero(kept.sum(axis=1) < (assigned >= 0).sum(axis=1))
@@ -227,4 +228,4 @@ def _similarity(source: FloatArray, target: FloatArray, points: FloatArray) -> F
     b = (target - target.mean(axis=0)) @ np.array([1.0, 1.0j])
     factor = np.vdot(a, b) / max(float(np.vdot(a, a).real), 1e-9)
     z = ((points - source.mean(axis=0)) @ np.array([1.0, 1.0j])) * factor
-    return np.stack([z.real, z.imag], axis=-1) + target.mean(axis=0)
+    return np.asarray(np.stack([z.real, z.imag], axis=-1) + target.mean(axis=0))

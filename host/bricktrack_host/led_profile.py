@@ -1,14 +1,15 @@
 """What a dome LED shows: where the centroid of its lit area falls, for a given pose.
 
 The lit body is a hemisphere on a lit cylinder, the collar, of the same radius. Seen from the pupil its
-outline is the hull of a circle (the tangent cone of the sphere, cut by the plane across the line of sight) and
-of an ellipse (the collar's rear rim), joined by straight lines: area and centroid have closed forms,
-perspective included. By symmetry the centroid is off the sphere's centre along the projected axis only. From the plane
-across the line of sight to the picture it goes through the ray model, at four points that carry the area's
-second moments, weighted by the local magnification: lens distortion across an LED is some 0.1 px.
+outline is the hull of a circle (the tangent cone of the sphere, cut by the plane across the line of sight)
+and of an ellipse (the collar's rear rim), joined by straight lines: area and centroid have closed forms,
+perspective included. By symmetry the centroid is off the sphere's centre along the projected axis only. From
+the plane across the line of sight to the picture it goes through the ray model, at four points that carry the
+area's second moments, weighted by the local magnification: distortion across an LED is some 0.1 px.
 
-Where the collar was never fitted (`BrickModel.led_profile` is `None`) the centroid is taken for the image of
-the sphere's centre, with an uncertainty along the projected axis that all LEDs share.
+Where the collar was never fitted (`BrickModel.led_profile` is `None`) the outline is taken for the sphere's,
+with an uncertainty along the projected axis that all LEDs share: the pose is then had from what is across the
+axes, and from the LEDs' disagreement.
 """
 
 from dataclasses import dataclass

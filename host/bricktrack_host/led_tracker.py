@@ -1,9 +1,9 @@
 """From the pictures of a run to identified centroids.
 
 Each picture is searched decimated, which is cheap and blind to no motion, and every find of an LED's size
-is measured at full resolution; no picture is kept. Then the run is identified (`led_identity`), and the areas
-are compared with what each LED shows in the rest of the run: LEDs partly covered, or run together with another
-light, are flagged.
+is measured at full resolution; no picture is kept. Then the run is identified (`led_identity`), and the
+areas are compared with what each LED shows in the rest of the run: LEDs partly covered, or run together with
+another light, are flagged.
 """
 
 import logging
@@ -17,6 +17,7 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.correspondence import MIN_INLIERS
+from bricktrack_host.finite import all_finite
 from bricktrack_host.led_identity import Identities, SegmentMethod, identify_run
 from bricktrack_host.led_profile import collar_of, predict_brick
 from bricktrack_host.quality import LedFlag, PoseFlag
@@ -95,8 +96,8 @@ def observe_leds(
     for done, (i, picture) in enumerate(pictures, start=1):
         if not last < i < n:
             raise TrackingError(
-                f"picture of frame {i} after frame {last}, with {n} time stamps; expected rising indices below "
-                "their number"
+                f"picture of frame {i} after frame {last}, with {n} time stamps; expected rising indices "
+                "below their number"
             )
         if picture.luma.shape != (mode.height, mode.width):
             raise TrackingError(
@@ -133,7 +134,7 @@ def observe_leds(
     R, t = found.R_camera_brick, found.t_camera_brick_mm
     _flag_areas(out, R, t, ray_model, brick_model)
     _widen_blurred(out)
-    seen = np.isfinite(out.uv_px).all(axis=-1)
+    seen = all_finite(out.uv_px)
     covered = np.zeros(seen.shape, dtype=bool)
     covered[seen] = ray_model.is_covered(out.uv_px[seen])
     out.led_flags[seen & ~covered] |= LedFlag.UNCOVERED
@@ -166,7 +167,7 @@ def _flag_areas(
     out: LedObservations, R: FloatArray, t: FloatArray, ray_model: RayModel, brick_model: BrickModel
 ) -> None:
     """Flag LEDs whose area is not what they show in the rest of the run, given the pose."""
-    posed = np.flatnonzero(np.isfinite(R).all(axis=(1, 2)))
+    posed = np.flatnonzero(all_finite(R, 2))
     if posed.size == 0:
         return
     # Bare profile where none was fitted: the ratio to the run's median takes the difference off.

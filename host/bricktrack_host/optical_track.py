@@ -14,6 +14,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.correspondence import prsoi_starts
+from bricktrack_host.finite import all_finite
 from bricktrack_host.led_identity import SegmentMethod
 from bricktrack_host.led_profile import collar_of
 from bricktrack_host.led_tracker import NOT_USED, observe_leds
@@ -81,7 +82,7 @@ def solve_poses(
             f"time stamps; the layout '{brick_model.name}' has {brick_model.n_leds} LEDs"
         )
     t_ns, led_t_ns = led_times_ns(observations, ray_model)
-    used = ((observations.led_flags & NOT_USED) == 0) & np.isfinite(observations.uv_px).all(axis=-1)
+    used = ((observations.led_flags & NOT_USED) == 0) & all_finite(observations.uv_px)
     uv = np.where(used[..., None], observations.uv_px, np.nan)
     start_R, start_t = prsoi_starts(uv, ray_model, brick_model, form)
     flags = np.asarray(observations.frame_flags, dtype=np.int64).copy()
@@ -123,13 +124,13 @@ def solve_poses(
         poses.covariance * _misfit(poses, uv)[:, None, None],
         poses.residual_px,
         flags,
-        np.isfinite(uv).all(axis=-1),
+        all_finite(uv),
         brick_model,
     )
 
 
 def _dof(uv: FloatArray) -> FloatArray:
-    return np.asarray(2.0 * np.isfinite(uv).all(axis=-1).sum(axis=1) - 6.0)
+    return np.asarray(2.0 * all_finite(uv).sum(axis=1) - 6.0)
 
 
 def _other_starts(
@@ -146,7 +147,7 @@ def _other_starts(
     Returns the better poses, and which frames have two that the pixels cannot tell apart; those have NaN.
     """
     n, n_leds = uv.shape[:2]
-    seen = np.isfinite(uv).all(axis=-1)
+    seen = all_finite(uv)
     enough = seen.sum(axis=1) >= MIN_LEDS
     bad = ~np.isfinite(poses.chi2) | (poses.chi2 > _DOUBT_CHI2_PER_DOF * np.maximum(_dof(uv), 1))
     hidden = seen.sum(axis=1) < n_leds
@@ -209,7 +210,7 @@ def _believe_neighbours(
     frames: IntArray,
     t_ns: IntArray,
 ) -> None:
-    """Settle frames with two poses by the frame beside them, where that is near one and far from the other."""
+    """Settle frames with two poses by the frame beside them, if near one and far from the other."""
     period = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
     row_of = {int(i): row for row, i in enumerate(frames)}
     for order in (range(len(t_ns)), range(len(t_ns) - 1, -1, -1)):
@@ -242,7 +243,7 @@ def _widest_triple(positions: FloatArray, seen: BoolArray) -> IntArray:
 
 def _without_outliers(uv: FloatArray, poses: RefinedPoses) -> FloatArray:
     """Leave out the worst LED of each frame whose residual is beyond belief, while five others remain."""
-    n_seen = np.isfinite(uv).all(axis=-1).sum(axis=1)
+    n_seen = all_finite(uv).sum(axis=1)
     sigmas = np.where(poses.is_outlier, poses.sigmas, 0.0)
     rest = np.nanmedian(np.where(np.isfinite(poses.sigmas), poses.sigmas, 0.0), axis=1)
     worst = sigmas.argmax(axis=1)
@@ -256,7 +257,7 @@ def _motion_to_leds(t_ns: IntArray, led_t_ns: IntArray, poses: RefinedPoses) -> 
     """Return how far the brick moves from each frame's instant to each LED's, by splines over frames."""
     n, n_leds = led_t_ns.shape
     rvec, shift = np.zeros((n, n_leds, 3)), np.zeros((n, n_leds, 3))
-    valid = np.flatnonzero(np.isfinite(poses.R_camera_brick).all(axis=(1, 2)))
+    valid = np.flatnonzero(all_finite(poses.R_camera_brick, 2))
     if valid.size >= 2:
         seconds = (t_ns - t_ns[valid[0]]) * 1e-9
         led_seconds = (led_t_ns - t_ns[valid[0]]) * 1e-9
@@ -298,7 +299,7 @@ def _finish(
     used: BoolArray,
     brick_model: BrickModel,
 ) -> OpticalTrack:
-    posed = np.isfinite(R).all(axis=(1, 2)) & np.isfinite(t).all(axis=1)
+    posed = all_finite(R, 2) & all_finite(t)
     flags[~posed] |= PoseFlag.NO_POSE
     flags[posed & ~used.all(axis=1)] |= PoseFlag.LED_MISSING
     flags[posed & (used.sum(axis=1) == MIN_LEDS)] |= PoseFlag.UNVERIFIED

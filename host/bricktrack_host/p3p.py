@@ -8,6 +8,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.camera_model import RayModel
+from bricktrack_host.finite import all_finite
 
 
 def ray_centre_mm(ray_model: RayModel) -> FloatArray:
@@ -90,7 +91,7 @@ def solve_p3p(bearings: FloatArray, points_mm: FloatArray) -> tuple[FloatArray, 
         t = (q1 + q2 + q3) / 3 - np.einsum("nkij,nj->nki", R, middle)
     area = np.linalg.norm(np.cross(p2 - p1, p3 - p1), axis=1)
     valid &= (area > 0.05 * np.sqrt(b2 * c2))[:, None]
-    valid &= np.isfinite(R).all(axis=(2, 3)) & np.isfinite(t).all(axis=2)
+    valid &= all_finite(R, 2) & all_finite(t)
     return R, t, valid
 
 

@@ -5,8 +5,8 @@ all LEDs lie in one plane parallel to the image (scaled orthography), which make
 the depths that this pose gives the LEDs correct the hits, and so on. It needs no start and no projection
 centre.
 
-Two differences from the paper as printed. Its eq. 21 takes ``k = -(i x j)``; in right-handed frames it must be
-``k = i x j``, or the iteration converges to wrong poses without a sign. And its eqs 6 and 20 divide, LED by
+Two differences from the paper as printed. Its eq. 21 takes ``k = -(i x j)``; in right-handed frames it must
+be ``k = i x j``, or the iteration converges to wrong poses without a sign. And its eqs 6 and 20 divide, LED by
 LED and axis by axis, by the hits' distances from the origin LED's, which are zero for LEDs in line with it:
 the "safe" form, the default, takes one ratio ``kappa`` for all LEDs and both axes. The "printed" form stays
 for comparison with the literature.
@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.rotations import nearest_rotation
+from bricktrack_host.finite import all_finite
 
 PrsoiForm = Literal["safe", "printed"]
 
@@ -110,7 +111,7 @@ def _iterate(
     if A.shape != B.shape or A.shape[1] != P.shape[0]:
         raise ShapeError(f"hits have shapes {A.shape} and {B.shape} for {P.shape[0]} LEDs; expected the same")
     n = A.shape[0]
-    seen = np.isfinite(A).all(axis=-1) & np.isfinite(B).all(axis=-1)
+    seen = all_finite(A) & all_finite(B)
     R_all = np.full((n, 3, 3), np.nan)
     t_all = np.full((n, 3), np.nan)
     converged = np.zeros(n, dtype=bool)
@@ -168,7 +169,7 @@ def _iterate(
             done |= change < _TOLERANCE_MM
             if (done | ~np.isfinite(change)).all():
                 break
-    good = done & np.isfinite(R).all(axis=(1, 2)) & np.isfinite(m)
+    good = done & all_finite(R, 2) & np.isfinite(m)
     if good.any():
         rotation = nearest_rotation(R[good])
         along = ((m - a) / (b - a))[:, None]

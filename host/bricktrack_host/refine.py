@@ -14,6 +14,7 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import matrix_from_rvec
+from bricktrack_host.finite import all_finite
 from bricktrack_host.led_profile import predict_brick
 
 HUBER_SIGMAS = 2.5
@@ -105,6 +106,7 @@ def refine_poses(
     collar_mm: float | None,
     motion: LedMotion | None = None,
     max_steps: int = 12,
+    profile_is_exact: bool = False,
 ) -> RefinedPoses:
     """Fit poses to centroids.
 
@@ -124,6 +126,9 @@ def refine_poses(
     max_steps : int
         Frames stop when their step is a thousandth of their uncertainty; two to four do from PRSOI.
 
+    profile_is_exact : bool
+        True: no uncertainty of the profile, for fitting it and for tests.
+
     Notes
     -----
     Levenberg-Marquardt damping frame by frame, so that no step raises the Huber cost. The covariance is the
@@ -137,8 +142,8 @@ def refine_poses(
             f"{brick_model.n_leds} LEDs; expected (n, n_leds, 2) and (n, n_leds, 2, 2)"
         )
     out = _nothing(n, n_leds)
-    seen = np.isfinite(uv_px).all(axis=-1) & np.isfinite(cov_px2).all(axis=(-2, -1))
-    started = np.isfinite(R_start).all(axis=(1, 2)) & np.isfinite(t_start_mm).all(axis=1)
+    seen = all_finite(uv_px) & all_finite(cov_px2, 2)
+    started = all_finite(R_start, 2) & all_finite(t_start_mm)
     frames = np.flatnonzero((seen.sum(axis=1) >= MIN_LEDS) & started)
     if frames.size == 0:
         return out
@@ -159,6 +164,7 @@ def refine_poses(
             ray_model,
             brick_model,
             collar_mm,
+            profile_is_exact,
             None if exp_led is None else exp_led[which],
         )
 
@@ -214,6 +220,7 @@ def _evaluate(
     ray_model: RayModel,
     brick_model: BrickModel,
     collar_mm: float | None,
+    profile_is_exact: bool,
     exp_led: FloatArray | None,
 ) -> _Evaluation:
     prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_mm)
@@ -222,7 +229,7 @@ def _evaluate(
         J = J.copy()
         J[..., :3] = J[..., :3] @ np.swapaxes(exp_led, -1, -2)
     residual = np.where(seen[..., None], uv - prediction.uv_px, 0.0)
-    m = prediction.model_shift_px
+    m = prediction.model_shift_px * (0.0 if profile_is_exact else 1.0)
     C = np.where(seen[..., None, None], cov + m[..., :, None] * m[..., None, :], np.eye(2))
     det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] ** 2
     W = np.empty_like(C)
@@ -240,7 +247,7 @@ def _evaluate(
     shift = np.einsum("nlik,nli->nk", WJ, m)
     behind = (t_led[..., 2] <= 0).any(axis=-1) if t_led.ndim == 3 else t_led[..., 2] <= 0
     cost = np.where(seen, huber, 0.0).sum(axis=1)
-    cost = np.where(behind | ~np.isfinite(A).all(axis=(1, 2)), np.inf, cost)
+    cost = np.where(behind | ~all_finite(A, 2), np.inf, cost)
     return _Evaluation(
         cost=cost,
         A=A,

@@ -133,7 +133,7 @@ def find_candidates(picture: Picture, *, radius_px: float | None = None) -> Cand
     for fraction in _LEVELS:
         cut = int(np.searchsorted(light, background + fraction * (brightest - background)))
         mask = cv2.threshold(small, max(cut - 1, 0), 255, cv2.THRESH_BINARY)[1]
-        n, labels, stats, middles = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
+        _, labels, stats, middles = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
         width, height, areas = stats[:, 2], stats[:, 3], stats[:, 4]
         fits = (areas >= low_area) & (areas <= high_area)
         longest = np.maximum(width, height)
