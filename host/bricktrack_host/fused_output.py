@@ -5,7 +5,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.fusion_problem import FusionSettings, Linearisation, Nodes, Run
-from bricktrack_host.imu_signal import ImuSignal
+from bricktrack_host.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.smoother import (
     BA,
@@ -41,11 +41,11 @@ def sample_motion(
 
     From the node before, the inertial samples carry the state to the instant, so what happened between nodes
     is kept. Where that path misses the node after (it does where the samples are not believed), the miss is
-    spread as white noise would: attitude linearly, velocity and position along the cubic that joins both ends.
+    spread as white noise would: attitude linearly, velocity and position along the cubic between both ends.
     A filter's state (``is_smoothed`` false) knows nothing of the node after and is only carried on.
     """
     n = len(nodes.t_s)
-    t_cam = (output_t_ns - run.signal.epoch_ns) * 1e-9
+    t_cam = seconds_since(output_t_ns, run.signal.epoch_ns)
     x0 = estimate.state.x[0, b]
     tau, rate = float(x0[TAU]), float(x0[SKEW])
     t = t_cam + tau + rate * (t_cam - run.t_mid_s)

@@ -188,9 +188,8 @@ def fuse_batch(
     """Return what `fuse` gives for each of many runs, in one loop over time for eight runs at once."""
     if camera != "static":
         raise ConfigError(
-            f"camera = {camera!r}: expected 'static'. When the camera moves, one IMU on the LED component cannot "
-            "tell the camera's acceleration from the brick's: the relative position is not observable. "
-            "Mount a second IMU with the camera, or smooth the optical poses alone (smooth_optical)."
+            f"camera = {camera!r}: expected 'static'. When the camera moves, one IMU on the LED component "
+            "cannot tell the camera's acceleration from the brick's: the position is not observable. Mount a second IMU with the camera, or smooth the optical poses alone (smooth_optical)."
         )
     settings = settings or FusionSettings()
     results: list[FusionResult] = []
@@ -218,7 +217,7 @@ def _attitude_at_first_node(run: Run, nodes: Nodes, lin: Linearisation) -> Float
     """Return the first frame's attitude carried back to the first node by the gyro."""
     k = int(nodes.node_of_frame[0])
     if k == 0:
-        return run.R_seen[0]
+        return np.asarray(run.R_seen[0])
     step = run.signal.increments(
         nodes.t_s[:k],
         nodes.t_s[1 : k + 1],
@@ -276,7 +275,7 @@ def _choose_noise(
     """Return the noise levels of gyro and accelerometer under which each run's frames are likeliest.
 
     The roughness of the accelerometer may count for less than stated, the systematic errors of both sensors
-    for more: all choices of all runs as one batch. The stated level stands unless others earn their difference.
+    for more: all choices of all runs as one batch. The stated level stands unless another earns its price.
     """
     steps = [(i, j) for i in (0, -1, -2) for j in (0, 1, 2)]
     price = np.array([_EARN_PER_STEP * (abs(i) + abs(j)) for i, j in steps])

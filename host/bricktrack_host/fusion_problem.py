@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.imu_signal import ImuSignal
+from bricktrack_host.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.smoother import ATT, BA, BG, GRAV, LAG, N_STATES, POS, SKEW, TAU, VEL, Problem, State
 from bricktrack_host.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
@@ -133,7 +133,7 @@ class Run:
         """Return what of a run is used: frames with a pose, and the time to be covered."""
         signal = ImuSignal.from_track(imu)
         seen = np.flatnonzero(has_pose(optical))
-        t_cam_s = (optical.t_ns[seen] - signal.epoch_ns) * 1e-9
+        t_cam_s = seconds_since(optical.t_ns[seen], signal.epoch_ns)
         cov = optical.covariance[seen].copy()
         cov[:, 3:] *= 1e-3
         cov[:, :, 3:] *= 1e-3
@@ -142,7 +142,7 @@ class Run:
         # IMU samples in camera time, as far as they reach beyond the frames.
         first = min(float(t_cam_s[0]), float(signal.t_s[0]) - alignment.offset_ns * 1e-9)
         last = max(float(t_cam_s[-1]), float(signal.t_s[-1]) - alignment.offset_ns * 1e-9)
-        wanted_s = (output_t_ns - signal.epoch_ns) * 1e-9
+        wanted_s = seconds_since(output_t_ns, signal.epoch_ns)
         span = (
             float(min(t_cam_s[0], max(first, wanted_s.min(initial=np.inf)))),
             float(max(t_cam_s[-1], min(last, wanted_s.max(initial=-np.inf)))),
@@ -203,11 +203,12 @@ def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
 
 
 def place_nodes(run: Run, lin: Linearisation) -> Nodes:
-    """Return a grid at the IMU's rate with the frames' instants let in."""
+    """Return a grid at the IMU's rate with the frames' instants let in, a step wider than what is wanted."""
     t_frame = run.imu_time_s(run.t_cam_s, lin)
     lo, hi = run.imu_time_s(np.array(run.span_cam_s), lin)
-    n = max(int(np.ceil((hi - lo) / run.signal.period_s)), 1)
-    grid = np.linspace(lo, hi, n + 1)
+    step = run.signal.period_s
+    n = int(np.ceil((hi - lo) / step)) + 2
+    grid = np.linspace(lo - step, hi + step, n + 1)
     i = np.clip(np.searchsorted(t_frame, grid), 1, len(t_frame) - 1) if len(t_frame) > 1 else None
     near = (
         np.minimum(np.abs(grid - t_frame[i]), np.abs(grid - t_frame[i - 1]))

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.ndimage import maximum_filter1d
 
-from bricktrack_common.arrays import BoolArray, FloatArray, as_float_array
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag
 from bricktrack_common.rotations import matrix_from_rvec
@@ -46,6 +46,11 @@ class Increments:
     dp_m: FloatArray
     R_half: FloatArray
     f_rate_mps3: FloatArray
+
+
+def seconds_since(t_ns: IntArray, epoch_ns: int) -> FloatArray:
+    """Return int64 ns as float seconds after an epoch: subtracted first, so that no digit is lost."""
+    return np.asarray((t_ns - epoch_ns) * 1e-9, dtype=np.float64)
 
 
 def _usable(imu: ImuTrack) -> BoolArray:
@@ -154,7 +159,7 @@ class ImuSignal:
                 "sort the samples"
             )
         epoch_ns = int(t_ns[0])
-        t_s = (t_ns - epoch_ns) * 1e-9
+        t_s = seconds_since(t_ns, epoch_ns)
         period_s = float(np.median(np.diff(t_s)))
         clip_limit = imu.acc_range_mps2 if imu.acc_range_mps2 > 0 else np.inf
         acc, clip_sd = _bridge_clipped(t_s, imu.acc_mps2[use], clip_limit)

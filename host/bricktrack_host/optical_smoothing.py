@@ -12,6 +12,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_common.rotations import matrix_from_rvec, right_jacobian, rvec_from_matrix
+from bricktrack_host.imu_signal import seconds_since
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.time_alignment import MIN_ROTATION_SD_RAD, has_pose
 from bricktrack_host.tracks import FusedTrack, OpticalTrack
@@ -123,12 +124,12 @@ def _choose_jerk(t_s: FloatArray, z: FloatArray, cov: FloatArray) -> FloatArray:
     summed over half a second about each frame, with a little of the whole run's to steady it.
     """
     index = np.arange(len(t_s))
-    window = max(int(round(_JERK_WINDOW_S / np.median(np.diff(t_s)))), 5)
+    window = max(round(_JERK_WINDOW_S / float(np.median(np.diff(t_s)))), 5)
 
     def best(trial: FloatArray, densities: FloatArray) -> FloatArray:
         ll = _Smoother(t_s, index, z, cov, trial).log_likelihood
         local = uniform_filter1d(ll, window, axis=0, mode="nearest") * window + 0.02 * ll.sum(axis=0)
-        return densities[np.argmax(local, axis=1)]
+        return np.asarray(densities[np.argmax(local, axis=1)])
 
     ones = np.ones((len(t_s), 1, 3))
     turn = np.full(len(t_s), _ROTATION_JERK[len(_ROTATION_JERK) // 2])
@@ -197,13 +198,13 @@ def smooth_optical(
     to_rvec[:, 3:, 3:] = np.eye(3)
     z, z_cov = np.concatenate([rvec, p_mm], axis=1), to_rvec @ cov @ np.swapaxes(to_rvec, 1, 2)
 
-    t_frame = (frame_ns - epoch_ns) * 1e-9
+    t_frame = seconds_since(frame_ns, epoch_ns)
     jerk = _choose_jerk(t_frame, z, z_cov)
     good = _good_frames(t_frame, z, z_cov, jerk, settings.gate_chi2)
     t_ns, back = np.unique(np.concatenate([frame_ns[good], output_t_ns]), return_inverse=True)
     frame = np.full(len(t_ns), -1)
     frame[back[: good.sum()]] = np.flatnonzero(good)
-    t_s = (t_ns - epoch_ns) * 1e-9
+    t_s = seconds_since(t_ns, epoch_ns)
     # In an interval between frames the livelier of its ends holds.
     after = np.clip(np.searchsorted(t_frame, t_s), 1, len(t_frame) - 1)
     node_jerk = np.maximum(jerk[after], jerk[after - 1])

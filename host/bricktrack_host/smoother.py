@@ -7,7 +7,8 @@ step of the one loop over time works on contiguous memory; a run shorter than th
 steps.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -85,16 +86,15 @@ class Problem:
         """
         n = gyro_var.shape[2]
         per_run = {"lever_arm_m", "bg_lin", "ba_lin", "tau_lin", "skew_lin", "lag_lin", "P_start"}
-        changed: dict[str, FloatArray | BoolArray] = {
+        changed: dict[str, Any] = {
             f.name: np.repeat(getattr(self, f.name), n, axis=0 if f.name in per_run else 1)
             for f in fields(self)
             if f.name not in ("start", "gyro_var", "acc_var")
         }
-        flat = (len(gyro_var), -1)
-        start = State(np.repeat(self.start.R, n, axis=0), np.repeat(self.start.x, n, axis=0))
-        return replace(
-            self, **changed, start=start, gyro_var=gyro_var.reshape(flat), acc_var=acc_var.reshape(flat)
-        )  # type: ignore[arg-type]
+        changed["start"] = State(np.repeat(self.start.R, n, axis=0), np.repeat(self.start.x, n, axis=0))
+        changed["gyro_var"] = gyro_var.reshape(len(gyro_var), -1)
+        changed["acc_var"] = acc_var.reshape(len(acc_var), -1)
+        return Problem(**changed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,7 +195,7 @@ def residuals(problem: Problem, state: State, at: IntArray, b: int) -> tuple[Flo
 
 
 def _process_noise(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Return the noise of attitude, position and velocity (K-1, B, 9, 9), and of the biases' wander (.., 6)."""
+    """Return the noise of attitude, position and velocity (K-1, B, 9, 9), and of the biases (.., 6)."""
     dt = problem.dt_s
     Q = np.zeros((*dt.shape, N_MOVING, N_MOVING))
     i = np.arange(3)
@@ -253,7 +253,7 @@ class Filter:
     def _run(self, keep: bool) -> None:
         pr = self._problem
         n_nodes, n_runs = pr.has_frame.shape
-        any_frame = pr.has_frame.any(axis=1)
+        any_frame = np.asarray(pr.has_frame.any(axis=1))
         effect, dt1 = _sensitivities(pr), pr.dt_s[..., None]
         Q, Q_walk = _process_noise(pr)
         F = np.zeros((n_runs, N_MOVING, N_STATES))  # the other rows are the identity's

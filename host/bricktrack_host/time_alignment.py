@@ -13,7 +13,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ConfigError, TrackingError
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
-from bricktrack_host.imu_signal import ImuSignal, chain_rotations
+from bricktrack_host.imu_signal import ImuSignal, chain_rotations, seconds_since
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 logger = logging.getLogger(__name__)
@@ -145,7 +145,7 @@ def _correlate(
     start, dt = t_s[:-1][pair], dt[pair]
     optical = rvec_from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:])[pair] / dt[:, None]
     n_side = int(np.ceil(max_offset_s / _GRID_S))
-    lags = centre_s + np.arange(-n_side, n_side + 1) * _GRID_S
+    lags = np.asarray(centre_s + np.arange(-n_side, n_side + 1) * _GRID_S, dtype=np.float64)
     begin = start + lags[:, None]
     inertial = (signal.angle_at(begin + dt) - signal.angle_at(begin)) / dt[:, None]
     use = ~(signal.in_gap(begin) | signal.in_gap(begin + dt))
@@ -234,7 +234,7 @@ class _RotationFit:
         basis = self._drift_basis(t, segment[inside])
         n, n_knots = basis.shape
         self._remove_bias(np.zeros(3))
-        offset, skew, sd = offset_s, 0.0, np.nan
+        offset, skew, sd = float(offset_s), 0.0, float("nan")
         covariance, bias_covariance = np.eye(2), np.eye(3)
         weight = np.ones(n)
         for iteration in range(12):
@@ -289,7 +289,7 @@ class _RotationFit:
         A = (design / sd_rad[:, None, None]).reshape(-1, 6)
         covariance = np.linalg.inv(A.T @ A + np.eye(6))
         bias = covariance @ (A.T @ (drift / sd_rad[:, None]).reshape(-1))
-        return bias[:3], covariance[:3, :3]
+        return np.asarray(bias[:3], dtype=np.float64), covariance[:3, :3]
 
 
 def align_times(
@@ -370,7 +370,7 @@ def align_times(
     if seen.sum() < MIN_POSES:
         return from_stamps(f"only {seen.sum()} frames have a pose; {MIN_POSES} are needed")
     # Seconds after the IMU's first sample, frames in camera time: the offset is what lies between.
-    t_s = (t_ns - signal.epoch_ns) * 1e-9
+    t_s = seconds_since(t_ns, signal.epoch_ns)
     R = optical.R_camera_brick[seen]
     sd_rad = np.sqrt(np.trace(optical.covariance[seen][:, :3, :3], axis1=1, axis2=2) / 3)
     sd_rad = np.maximum(sd_rad, MIN_ROTATION_SD_RAD)
@@ -418,15 +418,15 @@ def align_times(
         )
         logger.warning("%s", reason)
     return TimeAlignment(
-        offset_ns=best.offset_s * 1e9,
-        offset_sd_ns=best.offset_sd_s * 1e9,
+        offset_ns=float(best.offset_s * 1e9),
+        offset_sd_ns=float(best.offset_sd_s * 1e9),
         skew=best.skew,
         skew_sd=float(np.sqrt(best.covariance[1, 1])),
         t_mid_ns=t_mid_ns,
         gyro_bias_radps=best.bias_radps,
         gyro_bias_sd_radps=best.bias_sd_radps,
         correlation=correlation.at(best.offset_s)[0],
-        rotation_residual_sd=best.residual_sd,
+        rotation_residual_sd=float(best.residual_sd),
         source="data",
         is_trusted=True,
         disagrees_with_stamps=disagrees,
