@@ -8,6 +8,9 @@ motion). Every random choice comes from the seed, so that other seeds are other 
 Run: ``python scripts/bench_fusion.py $BRICKTRACK_SAMPLES/fusion --seeds 3``
 """
 
+import argparse
+import logging
+import time
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path

@@ -189,7 +189,8 @@ def fuse_batch(
     if camera != "static":
         raise ConfigError(
             f"camera = {camera!r}: expected 'static'. When the camera moves, one IMU on the LED component "
-            "cannot tell the camera's acceleration from the brick's: the position is not observable. Mount a second IMU with the camera, or smooth the optical poses alone (smooth_optical)."
+            "cannot tell the camera's acceleration from the brick's: the position is not observable. "
+            "Mount a second IMU with the camera, or smooth the optical poses alone (smooth_optical)."
         )
     settings = settings or FusionSettings()
     results: list[FusionResult] = []

@@ -287,7 +287,7 @@ class _RotationFit:
         integral = np.cumsum(span * attitude, axis=0)
         design = np.concatenate([-integral, np.broadcast_to(np.eye(3), attitude.shape)], axis=2)
         A = (design / sd_rad[:, None, None]).reshape(-1, 6)
-        covariance = np.linalg.inv(A.T @ A + np.eye(6))
+        covariance = np.asarray(np.linalg.inv(A.T @ A + np.eye(6)), dtype=np.float64)
         bias = covariance @ (A.T @ (drift / sd_rad[:, None]).reshape(-1))
         return np.asarray(bias[:3], dtype=np.float64), covariance[:3, :3]
 
