@@ -206,8 +206,6 @@ def spectrum_figure(result: RunResult) -> Figure | None:
         ax.set_xlim(0, 0.5 / step_s)
         if nyquist_hz is not None:
             ax.axvline(nyquist_hz, color=INK, lw=0.7, ls=":")
-            ax.annotate("half the frame rate", (nyquist_hz, 0.02), (3, 0), rotation=90, size=7, va="bottom",
-                        xycoords=("data", "axes fraction"), textcoords="offset points")  # fmt: skip
         ax.legend(loc="upper right")
     return fig
 

@@ -15,6 +15,7 @@ from bricktrack_host.results import DetailValue, RunResult
 from bricktrack_host.run_summary import KeyFigures, main_track
 from bricktrack_host.truth import COMPONENTS, GroupErrors, TruthComparison
 
+_SMALL_BYTES = 150_000  # an SVG below this is kept without trying the other
 _PNG_DPI = 190  # sharp on a screen of twice the usual density at the page's width
 
 
@@ -108,7 +109,7 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
         seconds = (result.rest.interval_ns[1] - result.rest.interval_ns[0]) / 1e9
         source = "given" if result.rest.source == "given" else "found by stillness"
         words = (
-            "Displacement of the first LED, and rotation vector, from the rest pose in the brick's axes there. "
+            "Displacement of the first LED, and rotation vector, from rest, in the brick's axes at rest. "
             f"The rest pose is the mean of {result.rest.n_frames} frames over {seconds:.2f} s ({source})."
         )
     else:
@@ -130,7 +131,7 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
             _embed(
                 spectrum,
                 "Spectra of displacement and rotation",
-                "Amplitude spectral density of the fused motion.",
+                "Amplitude density of the fused motion. Dotted: half the frame rate.",
             )
         )
     return section
@@ -151,8 +152,8 @@ def _closeup(result: RunResult, figures: KeyFigures) -> tuple[float, float] | No
 
 def _residual_section(result: RunResult) -> Section:
     section = Section("residuals", "Residuals of the LEDs", [
-        "Where each LED was seen less where the pose puts it. A single LED that stays off hints at the layout "
-        "or a reflection; all of them off together near the picture's edge hint at the calibration."
+        "Where each LED was seen less where the pose puts it. A single LED that stays off hints at the "
+        "layout or a reflection; all of them off together near the picture's edge hint at the calibration."
     ])  # fmt: skip
     rows = []
     for i, name in enumerate(result.led_names):
@@ -184,7 +185,7 @@ def _timing_words(result: RunResult, figures: KeyFigures) -> list[str]:
     fit = result.edge_fit
     if fit is not None:
         rate = "" if fit.nominal_hz is None else (
-            f"; the period is {fit.rate_ppm:+.2f} ± {1.96 * fit.rate_sd_ppm:.2f} ppm longer by the unit's clock "
+            f"; the period is {fit.rate_ppm:+.2f} ± {1.96 * fit.rate_sd_ppm:.2f} ppm longer by this clock "
             f"than that of {fit.nominal_hz:g} Hz"
         )  # fmt: skip
         words.append(
@@ -243,17 +244,22 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
         )
     section.figures.append(
         _embed(quality_plots.truth_figure(result, figures, truth), "Errors against the truth over time",
-               "Band: what the fused covariances promise, 95 %. Rare errors beyond the axes are in the tables.")
+               "Band: what the fused covariances promise, 95 %. The tables hold errors beyond the axes.")
     )  # fmt: skip
     return section
 
 
 def _embed(figure: Figure, alt: str, caption: str = "", *, half: bool = False) -> EmbeddedFigure:
-    """Return the figure as a data URI: SVG or PNG, whichever is smaller."""
+    """Return the figure as a data URI: SVG, or PNG where that is smaller."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # the layout is found; finding it again takes most of a save's time
     svg, png = io.BytesIO(), io.BytesIO()
     figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-    figure.savefig(png, format="png", dpi=_PNG_DPI, metadata={"Software": None})
-    kind, data = ("svg+xml", svg.getvalue()) if svg.tell() <= png.tell() else ("png", png.getvalue())
+    kind, data = "svg+xml", svg.getvalue()
+    if len(data) > _SMALL_BYTES:
+        figure.savefig(png, format="png", dpi=_PNG_DPI, metadata={"Software": None})
+        if png.tell() < len(data):
+            kind, data = "png", png.getvalue()
     return EmbeddedFigure(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", alt, caption, half)
 
 
