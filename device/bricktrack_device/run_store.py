@@ -365,6 +365,7 @@ class RunWriter:
         self.folder = store.runs / (run_id + PARTIAL_SUFFIX)
         self._entries: dict[str, FileEntry] = {}
         self._others_wrote = False
+        self._is_renamed = False
 
     def begin(self, draft: RunManifest) -> None:
         """Make the folder and write down what is known already, for a recovery.
@@ -374,6 +375,8 @@ class RunWriter:
         StorageError
             If that fails; so do all that follow.
         """
+        if self._is_renamed:
+            return
         try:
             if not self.folder.is_dir():
                 self._disk.make_folder(self.folder)
@@ -410,11 +413,15 @@ class RunWriter:
         manifest = msgspec.structs.replace(manifest, files=list(self._entries.values()))
         path = self.folder / MANIFEST_NAME
         try:
+            if self._is_renamed:
+                self._disk.sync_folder(self._final.parent)
+                return self._final
             self._disk.write_file(path, lambda f: f.write(dump_json(manifest)))
             (self.folder / DRAFT_NAME).unlink(missing_ok=True)
             self._disk.sync_folder(self.folder)
             self._disk.rename(self.folder, self._final)
         except OSError as e:
+            self._is_renamed = self._final.is_dir()
             raise _storage_error(f"{path}: the run cannot be finished", e) from e
         return self._final
 

@@ -1,0 +1,166 @@
+import gc
+
+import pytest
+from gpiozero.pins.mock import MockFactory, MockPin
+
+from bricktrack_common.errors import HardwareError
+from bricktrack_device.config import TriggerTable
+from bricktrack_device.trigger import Trigger
+
+MS = 1_000_000
+
+
+class Line:
+    """A mock pin whose edges are stamped by hand: the clock stands at the stamp when it is reported."""
+
+    def __init__(self, **settings: object) -> None:
+        self.now_ns = 5_000 * MS
+        self.factory = MockFactory()
+        self.pin: MockPin = self.factory.pin("GPIO17")
+        self.n_first = 0
+        self.trigger = Trigger(self.factory, TriggerTable(**settings), clock=lambda: self.now_ns)  # type: ignore[arg-type]
+
+    def arm(self) -> int:
+        return self.trigger.arm(self._count)
+
+    def _count(self) -> None:
+        self.n_first += 1
+
+    def edge(self, t_ns: int, level: int, *, reported_ns: int | None = None) -> None:
+        """Report a change as gpiozero does: through the pin's weak reference, ticks in seconds."""
+        self.now_ns = t_ns if reported_ns is None else reported_ns
+        method = self.pin.when_changed
+        assert method is not None
+        method(t_ns / 1e9, level)
+
+
+def test_the_first_rising_edge_after_arming_is_t0_and_all_later_ones_are_logged() -> None:
+    line = Line()
+    t = line.arm()
+    for k in range(5):
+        line.edge(t + (10 + 20 * k) * MS, 1)
+        line.edge(t + (20 + 20 * k) * MS, 0)
+    train = line.trigger.disarm()
+    assert train.t0_ns == t + 10 * MS
+    assert train.edges_ns == [t + (10 + 20 * k) * MS for k in range(5)]
+    assert (train.n_ignored, train.problems, line.n_first) == (0, [], 1)
+
+
+def test_real_mock_pin_changes_arrive_through_the_hook() -> None:
+    factory = MockFactory()
+    trigger = Trigger(factory, TriggerTable())
+    hits: list[int] = []
+    trigger.arm(lambda: hits.append(1))
+    pin = factory.pin("GPIO17")
+    pin.drive_high()
+    pin.drive_low()
+    pin.drive_high()
+    assert hits == [1] and trigger.n_edges == 2 and trigger.line_is_high is True
+    trigger.close()
+    assert trigger.line_is_high is None
+
+
+def test_a_line_high_at_arming_must_go_low_first() -> None:
+    line = Line()
+    line.pin.drive_high()
+    t = line.arm()
+    line.edge(t + 1 * MS, 1)  # a lost falling edge: the level was never seen low
+    assert line.trigger.t0_ns is None
+    line.edge(t + 5 * MS, 0)
+    line.edge(t + 15 * MS, 1)
+    train = line.trigger.snapshot()
+    assert train.t0_ns == t + 15 * MS and train.n_ignored == 1
+
+
+def test_without_require_low_the_next_rising_edge_counts() -> None:
+    line = Line(require_low=False)
+    line.pin.drive_high()
+    t = line.arm()
+    line.edge(t + 1 * MS, 1)
+    assert line.trigger.t0_ns == t + 1 * MS
+
+
+def test_an_edge_stamped_before_arming_but_reported_after_does_not_count() -> None:
+    line = Line()
+    t = line.arm()
+    line.edge(t - 1, 1, reported_ns=t + MS)
+    line.edge(t + 4 * MS, 0)
+    line.edge(t + 14 * MS, 1)
+    assert line.trigger.snapshot().t0_ns == t + 14 * MS
+
+
+def test_a_quiet_gap_skips_the_pulses_that_come_too_soon() -> None:
+    line = Line(quiet_gap_ms=30.0)
+    t = line.arm()
+    line.edge(t + 10 * MS, 1)  # 10 ms after arming
+    line.edge(t + 20 * MS, 0)
+    line.edge(t + 49 * MS, 1)  # 29 ms quiet
+    line.edge(t + 55 * MS, 0)
+    line.edge(t + 85 * MS, 1)  # 30 ms quiet
+    train = line.trigger.snapshot()
+    assert (train.t0_ns, train.n_ignored) == (t + 85 * MS, 2)
+
+
+def test_a_stamp_off_the_monotonic_clock_is_refused_in_words() -> None:
+    line = Line()
+    t = line.arm()
+    line.edge(t + 60_000 * MS, 1, reported_ns=t + 1 * MS)  # a real-time or foreign clock
+    line.edge(t + 2 * MS, 1)
+    train = line.trigger.snapshot()
+    assert train.t0_ns == t + 2 * MS
+    assert len(train.problems) == 1 and "CLOCK_MONOTONIC" in train.problems[0]
+
+
+def test_a_late_callback_keeps_the_kernels_stamp() -> None:
+    line = Line()
+    t = line.arm()
+    line.edge(t + 10 * MS, 1, reported_ns=t + 400 * MS)
+    assert line.trigger.t0_ns == t + 10 * MS
+
+
+def test_edges_out_of_order_are_left_out_and_counted() -> None:
+    line = Line()
+    t = line.arm()
+    for at in (10, 30, 20, 50):
+        line.edge(t + at * MS, 1)
+    train = line.trigger.snapshot()
+    assert train.edges_ns == [t + 10 * MS, t + 30 * MS, t + 50 * MS]
+    assert "1 edges were stamped before" in train.problems[0]
+
+
+def test_arming_again_forgets_the_train_before() -> None:
+    line = Line()
+    t = line.arm()
+    line.edge(t + 1 * MS, 1)
+    line.edge(t + 2 * MS, 0)
+    line.now_ns = t + 100 * MS
+    again = line.arm()
+    assert line.trigger.t0_ns is None
+    line.edge(again + 1 * MS, 1)
+    assert line.trigger.snapshot().edges_ns == [again + 1 * MS] and line.n_first == 2
+
+
+def test_the_hook_lives_as_long_as_the_trigger_and_no_longer() -> None:
+    line = Line()
+    t = line.arm()
+    gc.collect()
+    line.edge(t + 1 * MS, 1)
+    assert line.n_first == 1
+    del line.trigger
+    gc.collect()
+    assert line.pin.when_changed is None  # gpiozero holds it weakly
+    line.pin.drive_low()
+
+
+def test_half_an_hour_of_ticks_in_float_seconds_keeps_nanoseconds() -> None:
+    # Ticks come as float seconds: after 12 days of uptime (1e6 s) a float still resolves 0.12 ns.
+    line = Line()
+    line.now_ns = 1_000_000 * 10**9
+    t = line.arm()
+    line.edge(t + 123_456_789, 1)
+    assert line.trigger.t0_ns == t + 123_456_789
+
+
+def test_a_pin_that_does_not_exist_is_a_hardware_error_naming_it() -> None:
+    with pytest.raises(HardwareError, match="GPIO99"):
+        Trigger(MockFactory(), TriggerTable(pin="GPIO99"))
