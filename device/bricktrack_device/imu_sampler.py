@@ -23,7 +23,7 @@ from bricktrack_device.sample_buffer import SampleBuffer
 
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1
-_MCL_CURRENT_AND_FUTURE = 3
+_MCL_CURRENT_FUTURE_ONFAULT = 7  # pages stay once they were touched; untouched ones cost no memory
 _START_DELAY_NS = 20_000_000
 
 
@@ -179,7 +179,7 @@ def ask_for_realtime(wishes: SamplerTable) -> str:
         except OSError as e:
             granted.append(f"any core (core {cpu} refused: {e.strerror})")
     if wishes.lock_memory:
-        locked = _libc.mlockall(_MCL_CURRENT_AND_FUTURE) == 0
+        locked = _libc.mlockall(_MCL_CURRENT_FUTURE_ONFAULT) == 0
         granted.append(
             "memory locked" if locked else f"memory not locked ({os.strerror(ctypes.get_errno())})"
         )

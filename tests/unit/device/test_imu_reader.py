@@ -1,0 +1,88 @@
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from device_fakes import FakeBusOpener
+
+from bricktrack_common.clocks import monotonic_ns
+from bricktrack_device import imu_reader
+from bricktrack_device.config import ImuTable, SamplerTable
+from bricktrack_device.imu_reader import ImuReader
+
+ORDINARY = SamplerTable(priority=0, lock_memory=False)
+
+
+def reader_on(opener: FakeBusOpener) -> ImuReader:
+    return ImuReader(ImuTable(name="brick", period_ms=5), opener, ORDINARY, span_s=5.0)
+
+
+def poll_until(reader: ImuReader, condition: Callable[[], bool], timeout_s: float = 15.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, reader.problem or "nothing happened in time"
+        reader.poll()
+        time.sleep(0.005)
+
+
+def shared_memory_names() -> set[str]:
+    return {p.name for p in Path("/dev/shm").glob("psm_*")}
+
+
+def test_samples_of_a_window_come_on_the_grid() -> None:
+    before = shared_memory_names()
+    reader = reader_on(FakeBusOpener(fail_every=10))
+    reader.start()
+    try:
+        poll_until(reader, lambda: reader.is_ready)
+        description = reader.description()
+        assert description is not None and description.period_ns == 5_000_000
+        assert description.t0_ns % 5_000_000 == 0 and "ordinary scheduling" in reader.scheduling
+        start = monotonic_ns() + 50_000_000
+        end = start + 300_000_000
+        poll_until(reader, lambda: reader.has_slot_due_at(end))
+        records = reader.records(start, end)
+        due = [description.t0_ns + r.slot * description.period_ns for r in records]
+        assert all(start <= t <= end for t in due) and len(reader.slots_due(start, end)) in (60, 61)
+        assert 0.5 * 60 < len(records) <= 61
+        assert all(r.t_before_ns >= t for r, t in zip(records, due, strict=True))
+        status = reader.status()
+        assert status.samples > 0 and status.gaps > 0 and status.calibration == 0xFF and status.problem == ""
+    finally:
+        reader.stop()
+        reader.stop()
+    assert shared_memory_names() <= before
+    assert reader.status().samples == 0
+
+
+def test_a_hanging_sampler_is_noticed_and_ended() -> None:
+    reader = reader_on(FakeBusOpener(hang_after=20))
+    reader.start()
+    try:
+        poll_until(reader, lambda: bool(reader.problem))
+        assert "hangs" in reader.problem and not reader._process.is_alive()
+        assert len(reader.records(0, monotonic_ns())) == 20
+    finally:
+        reader.stop()
+
+
+def test_a_sensor_that_is_not_there_is_said_in_the_drivers_words() -> None:
+    reader = reader_on(FakeBusOpener(present=False))
+    reader.start()
+    try:
+        poll_until(reader, lambda: bool(reader.problem))
+        assert "0x28" in reader.problem and not reader.is_ready and reader.description() is None
+        assert reader.status().problem == reader.problem
+    finally:
+        reader.stop()
+
+
+def test_a_set_up_that_never_ends_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imu_reader, "SET_UP_TIMEOUT_S", 0.2)
+    reader = reader_on(FakeBusOpener(hang_after=0))
+    reader.start()
+    try:
+        poll_until(reader, lambda: bool(reader.problem))
+        assert "not set up within" in reader.problem
+    finally:
+        reader.stop()
