@@ -174,7 +174,7 @@ def _moved(first: FrameReport, now: FrameReport) -> list[str]:
     return moved
 
 
-def check_frame_rate(reports: Sequence[FrameReport]) -> None:
+def check_frame_rate(reports: Sequence[FrameReport], *, tolerance: float) -> None:
     """Make sure that frames come as often as their metadata say.
 
     The median is compared, so that single dropped frames do not count.
@@ -182,14 +182,14 @@ def check_frame_rate(reports: Sequence[FrameReport]) -> None:
     Raises
     ------
     HardwareError
-        If they come slower or faster by more than a hundredth.
+        If they come slower or faster by more than ``tolerance``, relative.
     """
     stamps = [r.sensor_timestamp_ns for r in reports]
     gaps_us = [(b - a) / 1000 for a, b in pairwise(stamps)]
     if not gaps_us:
         return
     found_us, said_us = median(gaps_us), reports[-1].frame_duration_us
-    if abs(found_us - said_us) > 0.01 * said_us:
+    if abs(found_us - said_us) > tolerance * said_us:
         raise HardwareError(
             f"camera: frames come every {found_us:.0f} us, but their metadata say {said_us} us. This "
             "computer does not keep up: lower camera.frame_rate_hz or camera.bitrate_bps, and stop other "

@@ -60,6 +60,8 @@ class PiCameraSettings:
         The main stream's pixel format. Every Raspberry Pi delivers YUV420.
     check_frames : int
         How many successive frames must hold the controls before the camera counts as started.
+    rate_tolerance : float
+        How far the median time between those frames may lie from the period that their metadata tell.
     buffer_counts : tuple of int
         How many buffers are tried for, one number after the other while memory is short.
     """
@@ -77,6 +79,7 @@ class PiCameraSettings:
     camera_num: int = 0
     picture_format: str = "YUV420"
     check_frames: int = 15
+    rate_tolerance: float = 0.01
     buffer_counts: tuple[int, ...] = (6, 5, 4)
 
     @property

@@ -28,8 +28,8 @@ logger = logging.getLogger(__name__)
 
 PICAMERA2_MINIMUM = "0.3.32"
 _INSTALL = "sudo apt install python3-picamera2, and a virtual environment with --system-site-packages"
-_SETTLE_S = 5.0
-_FIRST_PACKET_S = 5.0
+_SETTLE_S = 10.0
+_FIRST_PACKET_S = 10.0
 _STOP_S = 4.5
 """For all the steps of stopping together; the daemon gives up after 5 s."""
 _SILENT_NS = 1_000_000_000
@@ -111,13 +111,16 @@ class PiCamera:
 
         line_time_ns = self._line_time(model, camera_id)
         check = ControlsCheck(settings, line_time_ns / 1000)
-        settled.wait(_SETTLE_S)
+        deadline_ns = monotonic_ns() + round(_SETTLE_S * 1e9)
+        while not settled.wait(0.05):
+            if self._metadata.last_error is not None or monotonic_ns() > deadline_ns:
+                break
         self._metadata.on_report = None
         if self._metadata.last_error is not None:
             raise self._metadata.last_error
         check.require_steady()
         reports = check.reports
-        check_frame_rate(reports)
+        check_frame_rate(reports, tolerance=settings.rate_tolerance)
         mode_crop = self._mode_crop()
         mode = sensor_mode(
             model=model,
