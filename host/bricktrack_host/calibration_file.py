@@ -288,20 +288,27 @@ def load_calibration(path: Path) -> Calibration:
         )
     calibration = convert(data, Calibration, where=str(path), error=CalibrationError)
     try:
-        model = calibration.ray_model
-        if not 0 < calibration.plane_a_mm < calibration.plane_b_mm:
-            raise CalibrationError(
-                f"planes at {calibration.plane_a_mm:g} and {calibration.plane_b_mm:g} mm: expected 0 < a < b"
-            )
-        middle = np.array([calibration.sensor_mode.width - 1, calibration.sensor_mode.height - 1]) / 2
-        z_mm = calibration.plane_a_mm
-        seen = model.points_on_plane(middle, z_mm)
-        back = model.project(np.append(seen, z_mm)).uv_px
-        if not np.allclose(back, middle, atol=1e-6):
-            raise CalibrationError("the rays do not lead back to their pixels: the coefficients are damaged")
+        _check_rays(calibration)
     except CalibrationError as e:
         raise CalibrationError(f"{path}: {e}") from e
     return calibration
+
+
+def _check_rays(calibration: Calibration) -> None:
+    """Refuse rays that do not open towards the far plane, or do not lead back to their pixels."""
+    a_mm, b_mm = calibration.plane_a_mm, calibration.plane_b_mm
+    if not 0 < a_mm < b_mm:
+        raise CalibrationError(f"planes at {a_mm:g} and {b_mm:g} mm: expected 0 < a < b")
+    model = calibration.ray_model
+    middle = np.array([calibration.sensor_mode.width - 1, calibration.sensor_mode.height - 1]) / 2
+    uv = middle + middle / 4 * np.array([[-1.0, -1.0], [1.0, 1.0]])
+    at_a, at_b = model.points_on_plane(uv, a_mm), model.points_on_plane(uv, b_mm)
+    # u grows along x and v along y, at either plane, and more so farther away.
+    opens = np.all((at_a[1] - at_a[0] > 0) & (at_b[1] - at_b[0] > at_a[1] - at_a[0]))
+    if not opens or not np.allclose(
+        model.project(np.column_stack([at_b, [b_mm, b_mm]])).uv_px, uv, rtol=0, atol=1e-6
+    ):
+        raise CalibrationError("the rays do not lead back to their pixels: the coefficients are damaged")
 
 
 def require_match(calibration: Calibration, *, unit: str | None, sensor_mode: SensorMode) -> None:

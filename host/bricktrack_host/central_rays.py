@@ -20,6 +20,7 @@ from bricktrack_host.dot_observations import DotObservations
 from bricktrack_host.fit_residuals import PlaneResiduals, residuals_of
 from bricktrack_host.picture_region import ConvexRegion
 from bricktrack_host.pixel_polynomials import (
+    NEAREST_SHARE,
     InverseStart,
     PixelPolynomial,
     PixelScaling,
@@ -105,7 +106,7 @@ class CentralRays:
     def project(self, points_camera_mm: ArrayLike) -> Projection:
         """Return the pixels of points, shape (..., 3), mm, camera frame, with their Jacobian.
 
-        NaN behind the lens, farther outside the picture than `pixel_polynomials.PICTURE_MARGIN`, and
+        NaN behind or in the lens, farther outside the picture than `pixel_polynomials.PICTURE_MARGIN`, and
         where the inverse does not converge.
         """
         points, shape = as_points("points_camera_mm", points_camera_mm, 3)
@@ -117,7 +118,8 @@ class CentralRays:
 
     def _project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         from_centre = (points - self.centre_mm).T
-        depth = np.where(from_centre[2] > 0, from_centre[2], np.nan)
+        nearest = NEAREST_SHARE * (self.plane_a_mm - self.centre_mm[2])
+        depth = np.where(from_centre[2] > nearest, from_centre[2], np.nan)
         target = from_centre[:2] / depth
 
         def evaluate(st: FloatArray, which: Which) -> tuple[FloatArray, FloatArray]:
@@ -162,64 +164,90 @@ class CentralRays:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solution:
-    """Coefficients (n_terms + 1, 2) with x0, y0 last, z0, and residuals (n, 2) in mm."""
+    """Coefficients (n_terms + 1, 2) with x0, y0 last, and z0."""
 
     coefficients: FloatArray
     z0_mm: float
-    residual_mm: FloatArray
 
 
 class _Problem:
-    """The dots of all planes, one below the other, and the solution for any choice of them."""
+    """The dots of all planes, each plane's reduced once to as many equations as there are coefficients.
+
+    With V = Q R the monomials at a plane's dots, the equations ``(z - z0) V c + x0 = x`` become
+    ``(z - z0) R c + Q'1 x0 = Q'x`` whatever z0 and the plane's weight, and Q'1 is R's first column.
+    """
 
     def __init__(self, planes: Sequence[tuple[float, DotObservations]], mode: SensorMode, order: int) -> None:
         scaling = PixelScaling.of_mode(mode)
-        self.order = order
-        self.uv_px = np.concatenate([dots.uv_px for _, dots in planes])
-        self.xy_mm = np.concatenate([dots.xy_mm for _, dots in planes])
-        self.z_mm = np.concatenate([np.full(len(dots), z) for z, dots in planes])
-        self.plane = np.concatenate([np.full(len(dots), k) for k, (_, dots) in enumerate(planes)])
-        self.V = monomials(scaling.scaled(self.uv_px), order).T
-        self.weight = np.ones(len(self.z_mm))
+        self.what = f"central rays, order {order}"
+        self.z_mm = [z for z, _ in planes]
+        self.xy_mm = [dots.xy_mm for _, dots in planes]
+        self.V = [monomials(scaling.scaled(dots.uv_px), order).T for _, dots in planes]
+        self.Q, self.R = zip(*(np.linalg.qr(V) for V in self.V), strict=True)
+        self.weight = np.ones(len(planes))
+        n, needed = sum(len(xy) for xy in self.xy_mm), n_terms(order) + 1
+        if n < needed:
+            raise CalibrationError(
+                f"{self.what}: {n} dots for {needed} coefficients; take a lower order or more dots"
+            )
 
-    def design(self, z0_mm: float) -> FloatArray:
-        return np.hstack([(self.z_mm - z0_mm)[:, None] * self.V, np.ones((len(self.V), 1))])
+    def design(self, z0_mm: float, n_coefficients: int | None = None) -> FloatArray:
+        """Return the weighted, reduced equations' matrix."""
+        return np.vstack(
+            [
+                w * np.hstack([(z - z0_mm) * R[:, :n_coefficients], R[:, :1]])
+                for z, R, w in zip(self.z_mm, self.R, self.weight, strict=True)
+            ]
+        )
+
+    def wanted(self) -> FloatArray:
+        """Return the weighted, reduced equations' right side, for x and y."""
+        return np.vstack([w * (Q.T @ xy) for Q, xy, w in zip(self.Q, self.xy_mm, self.weight, strict=True)])
+
+    def by_z0(self, solution: _Solution) -> FloatArray:
+        """Return the derivative of the weighted, reduced model by z0, for x and y."""
+        c = solution.coefficients[:-1]
+        return np.vstack([-w * (R @ c) for R, w in zip(self.R, self.weight, strict=True)])
+
+    def residual_mm(self, solution: _Solution) -> list[FloatArray]:
+        """Return fit less truth at the dots, (n, 2) for each plane."""
+        c, xy0 = solution.coefficients[:-1], solution.coefficients[-1]
+        return [
+            (z - solution.z0_mm) * (V @ c) + xy0 - xy
+            for z, V, xy in zip(self.z_mm, self.V, self.xy_mm, strict=True)
+        ]
 
     def start_mm(self) -> float:
         """Return z0 from the affine parts: dots at b stand (b - z0) / (a - z0) closer than at a."""
-        V = self.V[:, :3]
         best, z0 = np.inf, 0.0
-        nearest = float(self.z_mm.min())
-        for candidate in np.linspace(-nearest, 0.9 * nearest, 39):
-            D = np.hstack([(self.z_mm - candidate)[:, None] * V, np.ones((len(V), 1))])
-            c, *_ = np.linalg.lstsq(D, self.xy_mm, rcond=None)
-            left = float(np.sum((D @ c - self.xy_mm) ** 2))
+        wanted = self.wanted()
+        for candidate in np.linspace(-min(self.z_mm), 0.9 * min(self.z_mm), 39):
+            D = self.design(float(candidate), 3)
+            c, *_ = np.linalg.lstsq(D, wanted, rcond=None)
+            left = float(np.sum((D @ c - wanted) ** 2))
             if left < best:
                 best, z0 = left, float(candidate)
         return z0
 
     def solve(self, z0_mm: float, *, steps: int = 30) -> _Solution:
         """Fit from a first z0 (variable projection)."""
-        what = f"central rays, order {self.order}"
-        w = self.weight[:, None]
-        wanted = w * self.xy_mm
+        wanted = self.wanted()
         for _ in range(steps):
-            q, r = np.linalg.qr(w * self.design(z0_mm))
-            onto = q.T @ wanted
-            residual = wanted - q @ onto
-            by_z0 = -w * (self.V @ np.linalg.lstsq(r, onto, rcond=None)[0][:-1])
-            by_z0 -= q @ (q.T @ by_z0)
-            step = float(np.sum(by_z0 * residual) / np.sum(by_z0 * by_z0))
+            D = self.design(z0_mm)
+            c, _ = least_squares(D, wanted, what=self.what)
+            q, _ = np.linalg.qr(D)
+            across = self.by_z0(_Solution(c, z0_mm))
+            across -= q @ (q.T @ across)
+            step = float(np.sum(across * (wanted - D @ c)) / np.sum(across * across))
             z0_mm += step
-            if not -10 * self.z_mm.max() < z0_mm < self.z_mm.min():
+            if not -10 * max(self.z_mm) < z0_mm < min(self.z_mm):
                 break
-            if abs(step) < 1e-9 * self.z_mm.max():
-                design = self.design(z0_mm)
-                c, _ = least_squares(w * design, wanted, what=what)
-                return _Solution(c, z0_mm, design @ c - self.xy_mm)
+            if abs(step) < 1e-9 * max(self.z_mm):
+                c, _ = least_squares(self.design(z0_mm), wanted, what=self.what)
+                return _Solution(c, z0_mm)
         raise CalibrationError(
-            f"{what}: the depth of the projection centre is not found (last {z0_mm:g} mm); the planes are "
-            "too close together or their depths, pitch or origins do not belong together"
+            f"{self.what}: the depth of the projection centre is not found (last {z0_mm:g} mm); the planes "
+            "are too close together or their depths, pitch or origins do not belong together"
         )
 
 
@@ -257,9 +285,10 @@ def fit_central_rays(
         coefficients=solution.coefficients[:-1].T.copy(),
         centre_mm=np.array([*solution.coefficients[-1], solution.z0_mm]),
         covariance=_covariance(problem, solution),
-        region=ConvexRegion.around(problem.uv_px),
+        region=ConvexRegion.around(np.concatenate([dots.uv_px for _, dots in planes])),
         residuals=tuple(
-            residuals_of(solution.residual_mm[problem.plane == k], z_mm=depths[k]) for k in range(len(planes))
+            residuals_of(residual, z_mm=z)
+            for residual, z in zip(problem.residual_mm(solution), depths, strict=True)
         ),
     )
 
@@ -274,13 +303,10 @@ def _solve(
     problem = _Problem(planes, sensor_mode, order)
     solution = problem.solve(problem.start_mm())
     # Where a plane scatters more (board print, light, distance), its dots weigh less in the second pass.
-    scatter = np.array(
-        [np.sqrt(np.mean(solution.residual_mm[problem.plane == k] ** 2)) for k in range(len(planes))]
-    )
+    scatter = np.array([np.sqrt(np.mean(r**2)) for r in problem.residual_mm(solution)])
     scatter = np.maximum(scatter, max(scatter.max() / MAX_WEIGHT_RATIO, 1e-12))
-    problem.weight = (scatter.min() / scatter)[problem.plane]
-    solution = problem.solve(solution.z0_mm)
-    return problem, solution
+    problem.weight = scatter.min() / scatter
+    return problem, problem.solve(solution.z0_mm)
 
 
 def left_out_errors_mm(
@@ -296,30 +322,36 @@ def left_out_errors_mm(
     of the fit to all.
     """
     problem, solution = _solve(planes, sensor_mode, order)
-    w = problem.weight[:, None]
+    # An orthonormal basis of the full equations: each plane's Q times the reduced equations' one.
+    small, _ = np.linalg.qr(problem.design(solution.z0_mm))
+    ends = np.cumsum([len(R) for R in problem.R])[:-1]
+    basis = np.vstack([Q @ part for Q, part in zip(problem.Q, np.split(small, ends), strict=True)])
+    w = np.concatenate([np.full(len(xy), w) for xy, w in zip(problem.xy_mm, problem.weight, strict=True)])
     errors = left_out_errors(
-        w * problem.design(solution.z0_mm),
-        w * problem.xy_mm,
+        basis,
+        w[:, None] * np.concatenate(problem.residual_mm(solution)),
         np.concatenate(list(folds)),
-        what=f"central rays, order {order}",
+        what=problem.what,
     )
-    return [(errors / w)[problem.plane == k] for k in range(len(planes))]
+    ends = np.cumsum([len(xy) for xy in problem.xy_mm])[:-1]
+    return np.split(errors / w[:, None], ends)
 
 
 def _covariance(problem: _Problem, solution: _Solution) -> FloatArray:
     """Return the covariance of [x coefficients, x0, y coefficients, y0, z0]."""
-    w = problem.weight[:, None]
-    D = w * problem.design(solution.z0_mm)
-    by_z0 = -w * (problem.V @ solution.coefficients[:-1])
-    m = n_terms(problem.order) + 1
+    D = problem.design(solution.z0_mm)
+    by_z0 = problem.by_z0(solution)
+    m = D.shape[1]
     along, inverse_normal = least_squares(D, by_z0, what="covariance of central rays")
     across = by_z0 - D @ along
-    residual = w * solution.residual_mm
-    freedom = max(2 * len(w) - 2 * m - 1, 1)
-    variance = float(np.sum(residual**2)) / freedom
+    residual = problem.residual_mm(solution)
+    freedom = max(2 * sum(len(r) for r in residual) - 2 * m - 1, 1)
+    variance = (
+        sum(float(np.sum((w * r) ** 2)) for w, r in zip(problem.weight, residual, strict=True)) / freedom
+    )
     covariance = np.zeros((2 * m + 1, 2 * m + 1))
     covariance[:m, :m] = covariance[m : 2 * m, m : 2 * m] = inverse_normal
     # Block inverse with the single column of z0: -along is how the others follow it.
     follow = np.concatenate([-along[:, 0], -along[:, 1], [1.0]])
     covariance += np.outer(follow, follow) / float(np.sum(across**2))
-    return covariance * variance
+    return np.asarray(covariance * variance)

@@ -19,6 +19,7 @@ from bricktrack_host.dot_observations import DotObservations
 from bricktrack_host.fit_residuals import PlaneResiduals, residuals_of
 from bricktrack_host.picture_region import ConvexRegion
 from bricktrack_host.pixel_polynomials import (
+    NEAREST_SHARE,
     InverseStart,
     PixelPolynomial,
     PixelScaling,
@@ -118,7 +119,7 @@ class TwoPlaneIrt:
     def project(self, points_camera_mm: ArrayLike) -> Projection:
         """Return the pixels of points, shape (..., 3), mm, camera frame, with their Jacobian.
 
-        NaN behind the lens, farther outside the picture than `pixel_polynomials.PICTURE_MARGIN`, and
+        NaN behind or in the lens, farther outside the picture than `pixel_polynomials.PICTURE_MARGIN`, and
         where the inverse does not converge.
         """
         points, shape = as_points("points_camera_mm", points_camera_mm, 3)
@@ -134,7 +135,7 @@ class TwoPlaneIrt:
         depth = z - self._middle_mm
         centre = self._centre_mm
         before = z - centre[2]
-        before = np.where(before > 0, before, np.nan)
+        before = np.where(before > NEAREST_SHARE * (self.plane_a_mm - centre[2]), before, np.nan)
 
         def evaluate(st: FloatArray, which: Which) -> tuple[FloatArray, FloatArray]:
             m = self._both.values_and_derivatives(st)
@@ -235,4 +236,6 @@ def left_out_errors_mm(
 ) -> FloatArray:
     """Return the errors, shape (n, 2), mm, at the dots of one plane left out of its fit fold by fold."""
     design = monomials(PixelScaling.of_mode(sensor_mode).scaled(dots.uv_px), order).T
-    return left_out_errors(design, dots.xy_mm, fold, what=f"two-plane, order {order}")
+    basis, _ = np.linalg.qr(design)
+    residual = basis @ (basis.T @ dots.xy_mm) - dots.xy_mm
+    return left_out_errors(basis, residual, fold, what=f"two-plane, order {order}")

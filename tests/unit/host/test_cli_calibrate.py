@@ -1,0 +1,146 @@
+"""``bricktrack calibrate fit`` on the simulated pictures that the repository carries, and on wrong input."""
+
+import csv
+import hashlib
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bricktrack_common.errors import BricktrackError, CalibrationError, ConfigError
+from bricktrack_host.calibration_file import load_calibration
+from bricktrack_host.cli.calibrate import app
+
+SAMPLE = Path(__file__).resolve().parents[2] / "data" / "path-traced"
+
+
+def fit(*arguments):
+    """Run the command; errors raised on purpose come out as they are."""
+    result = CliRunner().invoke(app, ["fit", *map(str, arguments)], env={"COLUMNS": "140", "NO_COLOR": "1"})
+    if isinstance(result.exception, BricktrackError):
+        raise result.exception
+    return result
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    path = tmp_path_factory.mktemp("calibration") / "sample.json"
+    result = fit(
+        "--rig",
+        SAMPLE / "rig.toml",
+        "--target",
+        "32x18",
+        "--unit",
+        "sample",
+        "--focus-note",
+        "f/2",
+        "-o",
+        path,
+    )
+    assert result.exit_code == 0, result.output
+    return path, result.output
+
+
+def test_the_sample_is_calibrated_and_reported(fitted):
+    path, output = fitted
+    calibration = load_calibration(path)
+    assert (calibration.unit, calibration.focus_note) == ("sample", "f/2")
+    assert calibration.simulated
+    assert "simulated" in output
+    # The sample's README: 490 whole dots at A, of which those that just touch the border may go; 576 at B.
+    assert 470 <= calibration.images[0].n_dots_found <= 490
+    assert calibration.images[1].n_dots_found == 576
+    assert (
+        calibration.images[0].sha256
+        == hashlib.sha256((SAMPLE / "calib_A_32x18.png").read_bytes()).hexdigest()
+    )
+    assert calibration.sensor_mode.line_time_ns == pytest.approx(18903.5)
+    # Dots are measured to about 0.02 px of 100 um at plane B.
+    assert calibration.residuals[1].mean_um < 3.0
+    for words in ("plane A: calib_A_32x18.png", "mean residual, um", "Model: central", "of the picture"):
+        assert words in output
+
+
+def test_the_flags_say_the_same_as_the_rig_file(fitted, tmp_path):
+    path = tmp_path / "flags.json"
+    result = fit(
+        "--plane-a", SAMPLE / "calib_A_32x18.png", "--a-mm", 101.117,
+        "--plane-b", SAMPLE / "calib_B_32x18.png", "--b-mm", 161.111,
+        "--pitch-mm", 4, "--columns", 32, "--rows", 18, "--origin-near", 960, 540, "--dot-diameter-mm", 2,
+        "--unit", "sample", "-o", path,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert load_calibration(path).rays == load_calibration(fitted[0]).rays
+
+
+def test_two_planes_can_be_asked_for(tmp_path):
+    path = tmp_path / "two.json"
+    result = fit(
+        "--rig", SAMPLE / "rig.toml", "--target", "32x18", "--unit", "s", "-o", path, "--model", "two-plane"
+    )
+    assert result.exit_code == 0, result.output
+    assert load_calibration(path).choice.model == "two-plane"
+    assert load_calibration(path).choice.order == 5
+    assert "Warning: rays outside are extrapolated" in result.output  # at B dots fill half of the picture
+
+
+@pytest.mark.skipif(
+    "BRICKTRACK_SAMPLES" not in os.environ, reason="BRICKTRACK_SAMPLES names no samples folder"
+)
+def test_the_rays_are_true_over_the_whole_picture(fitted):
+    """Judged at dots of a larger target, which the fit has not seen."""
+    model = load_calibration(fitted[0]).ray_model
+    with (Path(os.environ["BRICKTRACK_SAMPLES"]) / "path-traced/truth/calib_dots.csv").open() as f:
+        truth = [row for row in csv.DictReader(f) if row["target"] == "54x32"]
+    for plane, z_mm in (("A", 101.117), ("B", 161.111)):
+        rows = np.array(
+            [[float(r[k]) for k in ("u_px", "v_px", "x_mm", "y_mm")] for r in truth if r["plane"] == plane]
+        )
+        rows = rows[np.all((rows[:, :2] >= 0) & (rows[:, :2] <= [1919, 1079]), axis=1)]
+        error_um = 1e3 * np.hypot(*(model.points_on_plane(rows[:, :2], z_mm) - rows[:, 2:]).T)
+        assert error_um.mean() < 2.0
+        assert error_um.max() < 20.0
+
+
+def test_wrong_input_is_named(tmp_path):
+    rig = ("--rig", SAMPLE / "rig.toml")
+    out = ("--unit", "u", "-o", tmp_path / "c.json")
+    with pytest.raises(ConfigError, match="54x32"):
+        fit(*rig, *out, "--target", "9x9")
+    with pytest.raises(CalibrationError, match=r"calib_A_32x18\.png: No such file"):
+        fit(*rig, *out, "--target", "32x18", "--images-dir", tmp_path)
+    with pytest.raises(ConfigError, match="--a-mm, --plane-b"):
+        fit(*out, "--plane-a", "x.png")
+    with pytest.raises(ConfigError, match="--a-mm given together with --rig"):
+        fit(*rig, *out, "--a-mm", 100)
+    (tmp_path / "calib_A_32x18.png").write_text("no picture")
+    with pytest.raises(CalibrationError, match=r"calib_A_32x18\.png: not a picture"):
+        fit(*rig, *out, "--target", "32x18", "--images-dir", tmp_path)
+    cv2.imwrite(str(tmp_path / "calib_A_32x18.png"), np.zeros((480, 640), np.uint8))
+    with pytest.raises(CalibrationError, match="640 x 480 px; sensor mode"):
+        fit(*rig, *out, "--target", "32x18", "--images-dir", tmp_path)
+    cv2.imwrite(str(tmp_path / "calib_A_32x18.png"), np.zeros((1080, 1920), np.uint8))
+    with pytest.raises(CalibrationError, match=r"calib_A_32x18\.png: no dots found"):
+        fit(*rig, *out, "--target", "32x18", "--images-dir", tmp_path)
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_a_wrong_key_of_the_calibration_table_is_named_and_other_tables_pass(tmp_path):
+    text = (SAMPLE / "rig.toml").read_text()
+    rig = tmp_path / "rig.toml"
+    rig.write_text(text.replace("pitch_mm = 4.0", 'pitch_mm = "4"'))
+    out = ("--unit", "u", "-o", tmp_path / "c.json", "--target", "32x18")
+    with pytest.raises(ConfigError, match=r"rig\.toml: calibration\.pitch_mm"):
+        fit("--rig", rig, *out)
+    rig.write_text(text.replace("plane_a_mm", "plane_a_cm"))
+    with pytest.raises(ConfigError, match="plane_a_cm|plane_a_mm"):
+        fit("--rig", rig, *out)
+
+
+def test_help_shows_an_example():
+    result = CliRunner().invoke(app, ["fit", "--help"], env={"COLUMNS": "120"})
+    assert result.exit_code == 0
+    assert "--target 32x18" in result.output
