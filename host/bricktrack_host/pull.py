@@ -220,12 +220,15 @@ class _RunTransfer:
 
     def _fetch_file(self, client: UnitClient, part: PartFolder, index: int, file: FileSummary) -> None:
         for attempt in (1, 2):
-            for offset, data in client.read_chunks(
-                self.run_id, index, part.missing_chunks(file.name, CHUNK_BYTES)
-            ):
-                part.write(file.name, offset, data)
-                self.n_bytes_fetched += len(data)
-                self._tell(part.n_bytes_verified)
+            try:
+                for offset, data in client.read_chunks(
+                    self.run_id, index, part.missing_chunks(file.name, CHUNK_BYTES)
+                ):
+                    part.write(file.name, offset, data)
+                    self.n_bytes_fetched += len(data)
+                    self._tell(part.n_bytes_verified)
+            except TransferError as e:
+                raise TransferError(f"{self.run_id}: {file.name}: {e}") from e
             part.flush()
             found = part.sha256(file.name)
             if found == file.sha256:

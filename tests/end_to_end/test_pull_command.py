@@ -265,3 +265,24 @@ def test_a_rig_file_and_the_same_by_option_do_not_mix(tmp_path):
     assert "says the opposite" in result.stderr
     assert invoke(*import_arguments(tmp_path, "--rig", str(rig))).exit_code == 0
     assert read_run(tmp_path / "runs" / "b1_x").manifest.simulated
+
+
+def test_ctrl_c_does_not_wait_for_a_unit_that_does_not_answer(card):
+    asked = threading.Event()
+
+    def silent(request, messages):
+        asked.set()
+        return []
+
+    with FakeUnit(card, misbehave=silent) as unit:
+        host = subprocess.Popen(
+            [*BRICKTRACK, "arm", "--address", unit.address, "--timeout", "60"],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert asked.wait(20)
+        began = time.monotonic()
+        host.send_signal(signal.SIGINT)
+        _, stderr = host.communicate(timeout=20)
+    assert host.returncode == 130
+    assert stderr == "Interrupted.\n"
+    assert time.monotonic() - began < 10

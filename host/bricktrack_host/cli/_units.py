@@ -1,6 +1,7 @@
 """Which units a command is for: those of the fleet file, or one given by its address."""
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -72,14 +73,20 @@ def ask_units(
     units: list[UnitConfig], question: Callable[[UnitClient], T], *, timeout_s: float
 ) -> list[T | BricktrackError]:
     """Ask all units at once; return each one's answer, or the error it gave, in the order of ``units``."""
+    stop = threading.Event()
 
     def ask(unit: UnitConfig) -> T | BricktrackError:
         try:
-            with UnitClient(unit.address, timeout_s=timeout_s) as client:
+            with UnitClient(unit.address, timeout_s=timeout_s, stop=stop) as client:
                 check_name(client.hello(), unit)
                 return question(client)
         except BricktrackError as e:
             return e
 
     with ThreadPoolExecutor(min(MAX_WORKERS, len(units)), "ask") as pool:
-        return list(pool.map(ask, units))
+        answers = pool.map(ask, units)
+        try:
+            return list(answers)
+        except BaseException:
+            stop.set()  # Ctrl-C does not wait for a unit that is slow to answer
+            raise

@@ -1,0 +1,115 @@
+"""The host's client against the device's own file server and run store, without cameras or sensors."""
+
+import pytest
+from run_folders import contents, make_run
+
+from bricktrack_common.checksums import crc32
+from bricktrack_common.errors import TransferError, UnitError
+from bricktrack_common.wire_messages import (
+    Chunk,
+    Confirm,
+    Confirmed,
+    DescribeRun,
+    Hello,
+    HelloReply,
+    ListRuns,
+    Read,
+    RunList,
+)
+from bricktrack_device.file_server import FileServer
+from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.run_store import RunStore
+from bricktrack_host.fleet_config import UnitConfig
+from bricktrack_host.pull import pull_unit
+from bricktrack_host.unit_client import UnitClient
+
+RUN = "b1_9f31c2_0001_shake"
+
+
+class StoreHandler:
+    """Answers what concerns files, as the daemon does; ``busy`` stands for a recording under way."""
+
+    def __init__(self, store):
+        self.store = store
+        self.busy = False
+
+    def handle(self, request, answer):
+        match request:
+            case Hello():
+                answer(HelloReply(unit="b1", software="bricktrack", simulated=True), None)
+            case ListRuns():
+                answer(RunList(runs=self.store.list_runs()), None)
+            case DescribeRun():
+                answer(self.store.describe(request.run_id), None)
+            case Read():
+                if self.busy:
+                    raise RequestRefusedError("busy", "the unit is recording; it transfers nothing meanwhile")
+                data = self.store.read_chunk(
+                    request.run_id, request.file_index, request.offset, request.length
+                )
+                place = {f: getattr(request, f) for f in ("run_id", "file_index", "offset")}
+                answer(Chunk(**place, n_bytes=len(data), crc32=crc32(data)), data)
+            case Confirm():
+                self.store.confirm(request.run_id, request.sha256)
+                answer(Confirmed(run_id=request.run_id), None)
+            case _:
+                raise RequestRefusedError("bad-message", "not here")
+
+
+@pytest.fixture
+def served(tmp_path):
+    store = RunStore(tmp_path / "card", "b1", boot_id="9f31c2")
+    make_run(store.runs, RUN, {"video.h264": 1_500_000, "edges.msgpack": 100}, unit="b1")
+    make_run(store.runs, "b1_9f31c2_0002", {"video.h264": 10}, unit="b1")
+    handler = StoreHandler(store)
+    server = FileServer("127.0.0.1", 0, handler)
+    server.start()
+    yield store, handler, UnitConfig(name="b1", address=f"tcp://127.0.0.1:{server.port}")
+    server.stop()
+
+
+def test_runs_come_over_and_the_store_notes_it(served, tmp_path):
+    store, _, unit = served
+    result = pull_unit(unit, tmp_path / "runs")
+    assert result.errors == []
+    assert [r.run_id for r in result.runs] == [RUN, "b1_9f31c2_0002"]
+    assert contents(tmp_path / "runs" / RUN) == contents(store.runs / RUN)
+    assert all(r.confirmed for r in store.list_runs())
+    again = pull_unit(unit, tmp_path / "runs")
+    assert [r.outcome for r in again.runs] == ["already here"] * 2
+
+
+def test_a_file_that_shrank_on_the_card_is_not_confirmed_and_the_next_run_still_comes(served, tmp_path):
+    store, _, unit = served
+    (store.runs / RUN / "video.h264").write_bytes(b"short")
+    result = pull_unit(unit, tmp_path / "runs")
+    assert isinstance(result.errors[0], TransferError)
+    assert f"{RUN}: video.h264: " in str(result.errors[0])
+    assert [r.run_id for r in result.runs] == ["b1_9f31c2_0002"]
+    assert {r.run_id: r.confirmed for r in store.list_runs()} == {RUN: False, "b1_9f31c2_0002": True}
+
+
+def test_a_unit_that_records_is_left_alone_and_says_so(served, tmp_path):
+    _, handler, unit = served
+    handler.busy = True
+    result = pull_unit(unit, tmp_path / "runs")
+    assert len(result.errors) == 1  # the second run would be refused in the same way: not tried
+    assert "recording; it transfers nothing meanwhile" in str(result.errors[0])
+    handler.busy = False
+    assert pull_unit(unit, tmp_path / "runs").errors == []
+
+
+def test_refusals_of_the_real_server_have_their_codes(served):
+    _, _, unit = served
+    with UnitClient(unit.address) as client:
+        for ask, code in (
+            (lambda: client.describe_run("b1_none"), "no-such-run"),
+            (lambda: list(client.read_chunks(RUN, 9, [(0, 10)])), "no-such-file"),
+            (lambda: list(client.read_chunks(RUN, 1, [(9_999_999, 10)])), "out-of-range"),
+            (lambda: client.confirm(RUN, ["0" * 64]), "hash-mismatch"),
+            (client.status, "bad-message"),
+        ):
+            with pytest.raises(UnitError) as refused:
+                ask()
+            assert refused.value.code == code
+        assert client.hello().unit == "b1"
