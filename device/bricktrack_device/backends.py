@@ -8,8 +8,14 @@ from bricktrack_device.interfaces import Rig
 
 
 def _open_sim(config: DeviceConfig) -> Rig:
-    from bricktrack_device.sim.sim_rig import SimRig  # PyAV is only needed, and installed, for this
-
+    try:
+        from bricktrack_device.sim.sim_rig import SimRig
+    except ModuleNotFoundError as e:
+        if e.name != "av":
+            raise
+        raise ConfigError(
+            "backend: 'sim' needs PyAV, which is not installed here; install it with pip install 'bricktrack[sim]'"
+        ) from e
     return SimRig(config.sim)
 
 

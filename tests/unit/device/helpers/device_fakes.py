@@ -170,7 +170,9 @@ class FakeRig:
 
     simulated = True
 
-    def __init__(self, *, camera: FakeCamera | None = None, buses: dict[str, BusOpener] | None = None) -> None:
+    def __init__(
+        self, *, camera: FakeCamera | None = None, buses: dict[str, BusOpener] | None = None
+    ) -> None:
         self.camera = camera or FakeCamera()
         self.buses = buses or {}
         self.factory = MockFactory()
