@@ -149,6 +149,13 @@ def pull_run(
             if now_s - seen_s >= patience_s:
                 raise UnitTimeoutError(f"{run_id}: {e} What came is kept; pull again to go on") from e
             transfer.progress.note(unit, f"no answer during {run_id}; trying again")
+        except UnitError as e:
+            if e.code != "busy":
+                raise
+            raise UnitError(
+                f"{run_id}: {e}. What came is kept: pull again when it is idle, or 'bricktrack disarm' it",
+                code=e.code,
+            ) from e
         if (stop or threading.Event()).wait(backoff_s):
             raise Stopped
         backoff_s = min(2 * backoff_s, _MAX_BACKOFF_S)

@@ -109,7 +109,9 @@ class FakeUnit:
                 return RunDescription(run_id=run_id, files=self._files(run_id)), []
             case Read():
                 path = self.runs / request.run_id / self._files(request.run_id)[request.file_index].name
-                data = path.read_bytes()[request.offset : request.offset + request.length]
+                with path.open("rb") as file:
+                    file.seek(request.offset)
+                    data = file.read(request.length)
                 return (
                     Chunk(run_id=request.run_id, file_index=request.file_index, offset=request.offset,
                           n_bytes=len(data), crc32=crc32(data)),
