@@ -109,8 +109,8 @@ def fit_collar(
     longest = max_collar_radii * float(brick_model.led_radii_mm.max())
     if not 0 <= collar <= longest:
         raise CalibrationError(
-            f"fitted collar is {collar:.3f} mm; expected 0 to {longest:g} mm. Check the LEDs' axes and radii in "
-            "the layout, and the calibration."
+            f"fitted collar is {collar:.3f} mm; expected 0 to {longest:g} mm. Check the LEDs' axes and "
+            "radii in the layout, and the calibration."
         )
     residual, slope = problem.projected(collar)
     information = np.nansum(slope**2, axis=1)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bricktrack_common.arrays import FloatArray, as_float_array
+from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import skew
@@ -29,6 +29,27 @@ hemisphere (+0.19 r at 57 degrees) and a collar of two thirds of r (-0.09 r)."""
 FITTED_SHIFT_PER_RADIUS = 0.005
 """The same for a fitted profile, which is one of shape, not of brightness: limb darkening and the lens's blur
 leave thresholded centroids up to 0.3 px off the outline's at a radius of 60 px (path-traced sample)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensTerms:
+    """What the curvature of the map to the picture adds across an LED, beyond its derivative at the centre.
+
+    Some 0.3 px that change by a thousandth of that while a pose is refined: had once, they serve for all its
+    steps, which then cost one projection in place of five.
+
+    Attributes
+    ----------
+    uv_px : ndarray, shape (..., 2), px
+    J_px_per_mm : ndarray, shape (..., 2, 3), px/mm
+    """
+
+    uv_px: FloatArray
+    J_px_per_mm: FloatArray
+
+    def take(self, which: IntArray) -> "LensTerms":
+        """Return the terms of some frames."""
+        return LensTerms(self.uv_px[which], self.J_px_per_mm[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +70,8 @@ class LedPrediction:
         Cosine between the axis and the line of sight to the camera; an LED with 0 or less cannot be seen.
     model_shift_px : ndarray, shape (..., 2), px
         One standard deviation of what the profile leaves unknown, the same way in all LEDs of a type.
+    lens : LensTerms
+        What the map's curvature across the LED contributed.
     """
 
     uv_px: FloatArray
@@ -57,6 +80,7 @@ class LedPrediction:
     area_px2: FloatArray
     facing: FloatArray
     model_shift_px: FloatArray
+    lens: LensTerms
 
 
 def outline_moments(
@@ -121,6 +145,7 @@ def predict_leds(
     ray_model: RayModel,
     *,
     collar_mm: float | None,
+    lens: LensTerms | None = None,
 ) -> LedPrediction:
     """Predict what a camera sees of LEDs.
 
@@ -134,6 +159,8 @@ def predict_leds(
     ray_model : RayModel
     collar_mm : float or None
         `None`: not fitted; see the module.
+    lens : LensTerms, optional
+        Of a prediction nearby; default from four more projections.
     """
     centres = as_float_array("centres_camera_mm", centres_camera_mm, (..., 3))
     axes = as_float_array("axes_camera", axes_camera, (..., 3))
@@ -169,29 +196,43 @@ def predict_leds(
         area, half_length, per_s = areas[0], half_lengths[0], ratio[0]
         slope = (ratio[2] - ratio[1]) / (2 * step)
         unknown_mm = FITTED_SHIFT_PER_RADIUS * radii * s
-    middle = centres + (per_s * s)[..., None] * e1
-    # Four points with the area's second moments: exact for a quadratic map.
-    spread = np.sqrt(0.5) * np.stack([half_length, radii])[..., None] * np.stack([e1, e2])
-    points = middle + np.concatenate([spread, -spread])
-    seen = ray_model.project(points)
-    J1 = np.einsum("...ij,...j->...i", seen.J_px_per_mm, e1)
-    J2 = np.einsum("...ij,...j->...i", seen.J_px_per_mm, e2)
-    det = np.abs(J1[..., 0] * J2[..., 1] - J1[..., 1] * J2[..., 0])
-    weight = det / det.sum(axis=0)
-    J = np.einsum("k...,k...ij->...ij", weight, seen.J_px_per_mm)
+    offset = (per_s * s)[..., None] * e1
+    uv_flat = at_centre.uv_px + np.einsum("...ij,...j->...i", J0, offset)
+    if lens is None:
+        # Four points with the area's second moments: exact for a quadratic map.
+        spread = np.sqrt(0.5) * np.stack([half_length, radii])[..., None] * np.stack([e1, e2])
+        seen = ray_model.project(centres + offset + np.concatenate([spread, -spread]))
+        weight = _magnification(seen.J_px_per_mm, e1, e2)
+        weight /= weight.sum(axis=0)
+        lens = LensTerms(
+            uv_px=np.einsum("k...,k...i->...i", weight, seen.uv_px) - uv_flat,
+            J_px_per_mm=np.einsum("k...,k...ij->...ij", weight, seen.J_px_per_mm) - J0,
+        )
+    J = J0 + lens.J_px_per_mm
     # shift = per_s(c) * across(n), c = -n.d: its derivative by the axis n.
     dd = d[..., :, None] * d[..., None, :]
     d_shift = per_s[..., None, None] * (np.eye(3) - dd) - slope[..., None, None] * (
         across[..., :, None] * d[..., None, :]
     )
+    # Moving the LED turns its line of sight d, and with it what is seen of the shift.
+    turned = (facing * per_s / distance)[..., None, None] * (np.eye(3) - dd)
+    turned -= (slope / distance)[..., None, None] * across[..., :, None] * across[..., None, :]
     return LedPrediction(
-        uv_px=np.einsum("k...,k...i->...i", weight, seen.uv_px),
-        J_px_per_mm=J,
+        uv_px=uv_flat + lens.uv_px,
+        J_px_per_mm=J @ (np.eye(3) + turned),
         J_px_per_axis=J @ d_shift,
-        area_px2=area * det.mean(axis=0),
+        area_px2=area * _magnification(J, e1, e2),
         facing=facing,
-        model_shift_px=unknown_mm[..., None] * np.einsum("k...,k...i->...i", weight, J1),
+        model_shift_px=unknown_mm[..., None] * np.einsum("...ij,...j->...i", J, e1),
+        lens=lens,
     )
+
+
+def _magnification(J_px_per_mm: FloatArray, e1: FloatArray, e2: FloatArray) -> FloatArray:
+    """Return the picture's area per area of the plane that e1 and e2 span, px^2/mm^2."""
+    a = np.einsum("...ij,...j->...i", J_px_per_mm, e1)
+    b = np.einsum("...ij,...j->...i", J_px_per_mm, e2)
+    return np.asarray(np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]))
 
 
 def predict_brick(
@@ -201,6 +242,7 @@ def predict_brick(
     brick_model: BrickModel,
     *,
     collar_mm: float | None,
+    lens: LensTerms | None = None,
 ) -> tuple[LedPrediction, FloatArray]:
     """Predict all LEDs of bricks, and the derivative of their pixels by the pose.
 
@@ -221,7 +263,9 @@ def predict_brick(
     P, N = brick_model.led_positions_mm, brick_model.led_axes
     centres = np.einsum("nlij,lj->nli", np.broadcast_to(R, (R.shape[0], len(P), 3, 3)), P) + t
     axes = np.einsum("nlij,lj->nli", np.broadcast_to(R, (R.shape[0], len(P), 3, 3)), N)
-    prediction = predict_leds(centres, axes, brick_model.led_radii_mm, ray_model, collar_mm=collar_mm)
+    prediction = predict_leds(
+        centres, axes, brick_model.led_radii_mm, ray_model, collar_mm=collar_mm, lens=lens
+    )
     J = np.empty((*centres.shape[:2], 2, 6))
     J[..., :3] = -(prediction.J_px_per_mm @ (R @ skew(P)) + prediction.J_px_per_axis @ (R @ skew(N)))
     J[..., 3:] = prediction.J_px_per_mm

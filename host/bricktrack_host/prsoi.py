@@ -6,10 +6,10 @@ the depths that this pose gives the LEDs correct the hits, and so on. It needs n
 centre.
 
 Two differences from the paper as printed. Its eq. 21 takes ``k = -(i x j)``; in right-handed frames it must
-be ``k = i x j``, or the iteration converges to wrong poses without a sign. And its eqs 6 and 20 divide, LED by
-LED and axis by axis, by the hits' distances from the origin LED's, which are zero for LEDs in line with it:
-the "safe" form, the default, takes one ratio ``kappa`` for all LEDs and both axes. The "printed" form stays
-for comparison with the literature.
+be ``k = i x j``, or the iteration converges to wrong poses without a sign. And its eqs 6 and 20 divide, LED
+by LED and axis by axis, by the hits' distances from the origin LED's, which are zero for LEDs in line with
+it: the "safe" form, the default, takes one ratio ``kappa`` for all LEDs and both axes. The "printed" form
+stays for comparison with the literature.
 
 Everything is vectorised over frames, each with its own set of seen LEDs.
 """
@@ -156,11 +156,10 @@ def _iterate(
             i, j = IJ[..., 0] / s[:, None], IJ[..., 1] / s[:, None]
             k = cross_sign * np.cross(i, j)
             per_led = ((b - a) / s[:, None, None] - b + a * kappa) / (kappa - 1)  # eq. 20
-            m = (
-                per_led[:, 0, 0]
-                if not printed
-                else np.nanmean(np.where(used[..., None], per_led, np.nan), axis=(1, 2))
-            )
+            if printed:
+                m = np.where(used[..., None], per_led, 0.0).sum(axis=(1, 2)) / (2 * used.sum(axis=1))
+            else:
+                m = per_led[:, 0, 0]
             new_eps = np.einsum("nlc,nc->nl", G, k)
             change = np.abs(new_eps - eps).max(axis=1)
             eps = new_eps

@@ -5,6 +5,7 @@ covariance, and taken at the LED's own instant: the caller gives how far the bri
 frame's instant and the LED's.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -15,12 +16,14 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.finite import all_finite
-from bricktrack_host.led_profile import predict_brick
+from bricktrack_host.led_profile import LensTerms, predict_brick
 
 HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
 OUTLIER_SIGMAS = 5.0
 MIN_LEDS = 4
+_LENS_MM, _LENS_RAD = 0.5, 0.02
+"""Moved less than this, the lens terms of the start are good to 0.002 px."""
 _DONE_SIGMAS = 1e-3  # a last step this small, and the next smaller still, is far below the pose's own error
 
 
@@ -93,6 +96,12 @@ class _Evaluation:
     sigmas: FloatArray
     area: FloatArray
     facing: FloatArray
+    lens: LensTerms
+
+    def put(self, rows: IntArray, by: "_Evaluation", which: BoolArray | slice) -> None:
+        """Replace the frames ``rows`` by the frames ``which`` of another evaluation."""
+        for name in ("cost", "A", "g", "shift", "residual", "sigmas", "area", "facing"):
+            getattr(self, name)[rows] = getattr(by, name)[which]
 
 
 def refine_poses(
@@ -151,7 +160,7 @@ def refine_poses(
     exp_led = None if motion is None else matrix_from_rvec(motion.rvec_brick_rad)
     shift = None if motion is None else motion.shift_camera_mm
 
-    def evaluate(which: IntArray, R: FloatArray, t: FloatArray) -> _Evaluation:
+    def evaluate(which: IntArray, R: FloatArray, t: FloatArray, lens: LensTerms | None) -> _Evaluation:
         R_led, t_led = R, t
         if exp_led is not None and shift is not None:
             R_led, t_led = R[:, None] @ exp_led[which], t[:, None] + shift[which]
@@ -166,35 +175,21 @@ def refine_poses(
             collar_mm,
             profile_is_exact,
             None if exp_led is None else exp_led[which],
+            lens,
         )
 
-    state = evaluate(frames, R, t)
-    damping = np.full(frames.size, 1e-6)
-    live = np.isfinite(state.cost)
-    for _ in range(max_steps):
-        todo = np.flatnonzero(live)
-        if todo.size == 0:
-            break
-        A = state.A[todo]
-        diagonal = np.einsum("nii->ni", A)
-        step = np.linalg.solve(
-            A + (damping[todo, None] * diagonal + 1e-12)[..., None] * np.eye(6), state.g[todo][..., None]
-        )[..., 0]
-        size = np.linalg.norm(step[:, :3], axis=1)
-        step *= np.minimum(1.0, 0.5 / np.maximum(size, 1e-12))[:, None]
-        R_new = R[todo] @ matrix_from_rvec(step[:, :3])
-        t_new = t[todo] + step[:, 3:]
-        new = evaluate(frames[todo], R_new, t_new)
-        better = new.cost <= state.cost[todo] * (1 + 1e-12) + 1e-12
-        took, kept = todo[better], todo[~better]
-        R[took], t[took] = R_new[better], t_new[better]
-        for name in ("cost", "A", "g", "shift", "residual", "sigmas", "area", "facing"):
-            getattr(state, name)[took] = getattr(new, name)[better]
-        damping[took] = np.maximum(damping[took] / 10, 1e-9)
-        damping[kept] = np.maximum(damping[kept] * 100, 1e-4)
-        small = np.einsum("ni,nij,nj->n", step, A, step) < _DONE_SIGMAS**2
-        live[todo[small & better]] = False
-        live[damping > 1e6] = False
+    state = evaluate(frames, R, t, None)
+    _descend(evaluate, state, frames, R, t, max_steps)
+    moved = np.linalg.norm(t - t_start_mm[frames], axis=1) > _LENS_MM
+    moved |= np.linalg.norm(R - R_start[frames], axis=(1, 2)) > _LENS_RAD
+    moved &= np.isfinite(state.cost)
+    if moved.any():  # the lens terms are of the start: have them anew
+        again = np.flatnonzero(moved)
+        R_again, t_again = R[again], t[again]
+        fresh = evaluate(frames[again], R_again, t_again, None)
+        _descend(evaluate, fresh, frames[again], R_again, t_again, 3)
+        R[again], t[again] = R_again, t_again
+        state.put(again, fresh, slice(None))
     good = np.isfinite(state.cost)
     condition = np.linalg.cond(state.A[good]) if good.any() else np.zeros(0)
     good[np.flatnonzero(good)[condition > 1e14]] = False
@@ -211,6 +206,39 @@ def refine_poses(
     return out
 
 
+def _descend(
+    evaluate: Callable[[IntArray, FloatArray, FloatArray, LensTerms | None], _Evaluation],
+    state: _Evaluation,
+    frames: IntArray,
+    R: FloatArray,
+    t: FloatArray,
+    max_steps: int,
+) -> None:
+    """Take damped Gauss-Newton steps, in place, until each frame's step is far below its uncertainty."""
+    damping = np.full(frames.size, 1e-6)
+    live = np.isfinite(state.cost)
+    for _ in range(max_steps):
+        todo = np.flatnonzero(live)
+        if todo.size == 0:
+            break
+        A = state.A[todo]
+        damped = damping[todo, None] * np.einsum("nii->ni", A) + 1e-12
+        step = np.linalg.solve(A + damped[..., None] * np.eye(6), state.g[todo][..., None])[..., 0]
+        size = np.linalg.norm(step[:, :3], axis=1)
+        step *= np.minimum(1.0, 0.5 / np.maximum(size, 1e-12))[:, None]
+        R_new, t_new = R[todo] @ matrix_from_rvec(step[:, :3]), t[todo] + step[:, 3:]
+        new = evaluate(frames[todo], R_new, t_new, state.lens.take(todo))
+        better = new.cost <= state.cost[todo] * (1 + 1e-12) + 1e-12
+        took, kept = todo[better], todo[~better]
+        R[took], t[took] = R_new[better], t_new[better]
+        state.put(took, new, better)
+        damping[took] = np.maximum(damping[took] / 10, 1e-9)
+        damping[kept] = np.maximum(damping[kept] * 100, 1e-4)
+        small = np.einsum("ni,nij,nj->n", step, A, step) < _DONE_SIGMAS**2
+        live[todo[small & better]] = False
+        live[damping > 1e6] = False
+
+
 def _evaluate(
     uv: FloatArray,
     cov: FloatArray,
@@ -222,14 +250,16 @@ def _evaluate(
     collar_mm: float | None,
     profile_is_exact: bool,
     exp_led: FloatArray | None,
+    lens: LensTerms | None,
 ) -> _Evaluation:
-    prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_mm)
+    prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_mm, lens=lens)
     if exp_led is not None:
         # R_led = R E: a turn dtheta of the frame's brick is E^T dtheta of the LED's.
         J = J.copy()
         J[..., :3] = J[..., :3] @ np.swapaxes(exp_led, -1, -2)
     residual = np.where(seen[..., None], uv - prediction.uv_px, 0.0)
     m = prediction.model_shift_px * (0.0 if profile_is_exact else 1.0)
+    m = np.where(seen[..., None], m, 0.0)
     C = np.where(seen[..., None, None], cov + m[..., :, None] * m[..., None, :], np.eye(2))
     det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] ** 2
     W = np.empty_like(C)
@@ -257,6 +287,7 @@ def _evaluate(
         sigmas=np.where(seen, sigmas, np.nan),
         area=prediction.area_px2,
         facing=prediction.facing,
+        lens=prediction.lens,
     )
 
 

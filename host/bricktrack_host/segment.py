@@ -215,7 +215,9 @@ def _blobs_of(spots: list[Spot], shape: tuple[int, ...]) -> Blobs:
     odd = (fill < _MIN_FILL) | (eccentricity > _MAX_ECCENTRICITY)
     good = ~odd & (flags == 0)
     usual = float(np.median(areas[good])) if good.any() else float(np.median(areas))
-    flags[odd & (areas > 1.3 * usual)] |= LedFlag.MERGED
+    # Foreshortened domes are small and elongated, near ones large and round: large and elongated are two.
+    pair = (areas > 1.4 * usual) & (eccentricity > 0.7)
+    flags[(odd & (areas > 1.3 * usual)) | pair] |= LedFlag.MERGED
     flags[odd & (areas <= 1.3 * usual)] |= LedFlag.PARTLY_COVERED
     return Blobs(
         uv_px=np.array([s.uv_px for s in spots]),

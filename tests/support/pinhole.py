@@ -15,11 +15,11 @@ FloatArray = NDArray[np.float64]
 class PinholeCamera:
     """``u = f x' + u0`` with radial (k1, k2) and tangential (p1, p2) distortion of the slopes x/z, y/z."""
 
-    f_px: float = 2700.0
+    f_px: float = 1560.0
     u0_px: float = 959.5
     v0_px: float = 539.5
-    k1: float = -0.12
-    k2: float = 0.05
+    k1: float = 0.06
+    k2: float = -0.02
     p1: float = 4e-4
     p2: float = -3e-4
     sensor_mode: SensorMode = IMX219_1080P
