@@ -30,7 +30,8 @@ from bricktrack_host.report import ReportExtras, write_report
 from bricktrack_host.rest_pose import tare
 from bricktrack_host.results import Provenance, RunResult, write_results
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
-from bricktrack_host.truth import TrueMotion, compare_with_truth
+from bricktrack_host.true_motion import TrueMotion
+from bricktrack_host.truth import compare_with_truth
 
 LED_NAMES = ("m0", "m1", "m2", "m3", "m4", "m5", "m6")
 LEDS_MM = np.array(

@@ -13,13 +13,13 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import StorageError
 from bricktrack_common.imu_records import ImuFlag
-from bricktrack_host.plots import CalibrationPicture, FrameOverlay, style
+from bricktrack_host.plots import style
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.report_sections import ReportExtras, in_words, report_sections, value_text
 from bricktrack_host.results import RunResult
 from bricktrack_host.run_summary import KeyFigures, key_figures, main_track, verdict
 
-__all__ = ["CalibrationPicture", "FrameOverlay", "ReportExtras", "render_report", "write_report"]
+__all__ = ["ReportExtras", "flag_meanings", "recording_date", "render_report", "write_report"]
 
 _FIRST_DATE = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)  # before it, the clock was never set
 

@@ -5,7 +5,6 @@ processed again gives the same bytes.
 """
 
 import importlib.metadata
-import os
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +21,7 @@ from bricktrack_common.errors import RunFormatError, StorageError
 from bricktrack_common.run_manifest import RunManifest
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_host.daq_clock import EdgeFit, fit_edges
+from bricktrack_host.durable_files import sync_file, sync_folder
 from bricktrack_host.rest_pose import RestPose
 from bricktrack_host.result_tables import (
     CONVENTIONS,
@@ -180,25 +180,17 @@ def write_results(result: RunResult, folder: Path) -> None:
                 shutil.rmtree(leftover)
         partial.mkdir(parents=True)
         _write_files(result, partial)
-        for path in (*sorted(partial.iterdir()), partial):
-            _sync(path)
+        for path in sorted(partial.iterdir()):
+            sync_file(path)
+        sync_folder(partial)
         if folder.exists():
             folder.rename(previous)
         partial.rename(folder)
-        _sync(folder.parent)
+        sync_folder(folder.parent)
         if previous.exists():
             shutil.rmtree(previous)
     except OSError as e:
         raise StorageError(f"{folder}: results cannot be written: {e.strerror or e}") from e
-
-
-def _sync(path: Path) -> None:
-    """Have a file's bytes, or a folder's entries, on the disk before going on."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _write_files(result: RunResult, folder: Path) -> None:

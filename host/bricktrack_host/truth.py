@@ -15,16 +15,7 @@ from bricktrack_host.quality import PoseFlag
 from bricktrack_host.rest_pose import RestPose
 from bricktrack_host.results import RunResult
 from bricktrack_host.tracks import FusedTrack, OpticalTrack
-from bricktrack_host.true_motion import TrueMotion, read_true_motion
-
-__all__ = [
-    "GroupErrors",
-    "TrueMotion",
-    "TruthComparison",
-    "compare_with_truth",
-    "comparison_table",
-    "read_true_motion",
-]
+from bricktrack_host.true_motion import TrueMotion
 
 IMPACT_MPS2 = 30.0  # about 3 g: above the strongest shaking of the table, below the weakest impact
 NEAR_IMPACT_NS = 50_000_000

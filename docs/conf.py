@@ -1,0 +1,36 @@
+"""Configuration of the documentation: ``sphinx-build -W docs docs/_build/html``, no network needed."""
+
+import importlib.metadata
+
+project = "bricktrack"
+author = "the bricktrack authors"
+version = release = importlib.metadata.version("bricktrack")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+templates_path = ["_templates"]
+source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 3
+
+# `name` in a docstring links where it can, and stays code where it cannot.
+default_role = "py:obj"
+autosummary_generate = True
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # types, shapes and units stand in the docstrings
+autodoc_default_options = {"members": True}
+napoleon_google_docstring = False
+# A list also takes two names on one line, and describes each field once.
+napoleon_custom_sections = [("Attributes", "params_style")]
+napoleon_use_rtype = False
+
+html_theme = "furo"
+html_title = "bricktrack"
+html_copy_source = False
+html_show_sphinx = False
+html_show_copyright = False
+html_theme_options = {
+    "light_css_variables": {"color-brand-primary": "#1f5f8b", "color-brand-content": "#1f5f8b"},
+    "dark_css_variables": {"color-brand-primary": "#8bbcdc", "color-brand-content": "#8bbcdc"},
+}
