@@ -133,6 +133,7 @@ class ImuSignal:
     _acc: CubicSpline[Any]
     _gyro_integral: PPoly[Any]
     _acc_integral: PPoly[Any]
+    _acc_double: PPoly[Any]
 
     @classmethod
     def from_track(cls, imu: ImuTrack) -> "ImuSignal":
@@ -190,6 +191,7 @@ class ImuSignal:
             _acc=acc_spline,
             _gyro_integral=gyro_spline.antiderivative(),
             _acc_integral=acc_spline.antiderivative(),
+            _acc_double=acc_spline.antiderivative(2),
         )
 
     def _held(self, t_s: FloatArray) -> FloatArray:
@@ -245,24 +247,30 @@ class ImuSignal:
         grid = start_s[:, None] + dt * np.linspace(0.0, 1.0, 2 * _SUBSTEPS + 1)
         angle = self.angle_at(grid)
         angle = angle - angle[:, :1] - bg[:, None] * (grid - grid[:, :1])[..., None]
-        velocity = np.diff(self._integral(self._acc_integral, self._acc, grid[:, ::2] + acc_lag_s), axis=1)
-        velocity = velocity - ba[:, None] * (dt / _SUBSTEPS)[..., None]
         h = dt / _SUBSTEPS
+        ends = grid[:, ::2] + acc_lag_s
+        held = self._held(ends)
+        beyond, force = (ends - held)[..., None], self.acc_at(ends)
+        once, twice = np.asarray(self._acc_integral(held)), np.asarray(self._acc_double(held))
+        # Held constant beyond the samples, and integrated so.
+        twice = twice + once * beyond + 0.5 * force * beyond**2
+        once = once + force * beyond
+        velocity = np.diff(once, axis=1) - ba[:, None] * h[..., None]
+        shift = np.diff(twice, axis=1) - once[:, :-1] * h[..., None] - 0.5 * ba[:, None] * h[..., None] ** 2
 
         R = np.broadcast_to(np.eye(3), (len(start_s), 3, 3))
         R_half = R
         dv, dp = np.zeros((len(start_s), 3)), np.zeros((len(start_s), 3))
         half = matrix_from_rvec(np.diff(angle, axis=1))  # rotations over half sub-steps
         for i in range(_SUBSTEPS):
-            step = np.einsum("nij,njk,nk->ni", R, half[:, 2 * i], velocity[:, i])
-            dp = dp + dv * h + 0.5 * step * h
-            dv = dv + step
+            turned = R @ half[:, 2 * i]
+            dp = dp + dv * h + np.einsum("nij,nj->ni", turned, shift[:, i])
+            dv = dv + np.einsum("nij,nj->ni", turned, velocity[:, i])
             R = R @ half[:, 2 * i] @ half[:, 2 * i + 1]
             if 2 * (i + 1) == _SUBSTEPS:
                 R_half = R
         safe = np.where(dt == 0, 1.0, dt)
-        ends = self.acc_at(np.stack([start_s, end_s]) + acc_lag_s)
-        rate = np.where(dt == 0, 0.0, (ends[1] - ends[0]) / safe)
+        rate = np.where(dt == 0, 0.0, (force[:, -1] - force[:, 0]) / safe)
         return Increments(R=R, dv_mps=dv, dp_m=dp, R_half=R_half, f_rate_mps3=rate)
 
 

@@ -23,6 +23,7 @@ _GRID_S = 0.004  # of the cross-correlation
 _NODE_S = 0.0025  # of the integrated gyro
 _KNOT_S = 0.5  # of the slow drift between integrated gyro and optics: its noise, bias and scale error
 _MIN_VECTOR_CORRELATION = 0.4  # noise alone stays below 0.2 over 400 frames
+_CLEAR_SPEED_CORRELATION = 0.8
 _UNKNOWN_BIAS_RADPS = 0.02  # BNO055 data sheet: zero-rate offset at most 3 deg/s, typically 1
 MIN_ROTATION_SD_RAD = 1e-5  # a covariance below this is not believed
 _AMBIGUOUS_SIGMA = 5.0
@@ -384,6 +385,12 @@ def align_times(
     fits.sort(key=lambda fit: fit.residual_sd)
     best = fits[0]
     speed, vector = correlation.at(best.offset_s)
+    if vector < _MIN_VECTOR_CORRELATION and np.nanmax(correlation.speed) > _CLEAR_SPEED_CORRELATION:
+        return from_stamps(
+            "the angular speeds agree, their directions do not: the IMU's axes are not the layout file's",
+            None,
+            float(np.nanmax(correlation.speed)),
+        )
     if best.offset_sd_s * 1e9 > max_sd_ns:
         return from_stamps(
             f"too little rotation: the motion tells the offset to {best.offset_sd_s * 1e3:.2g} ms only "
@@ -392,13 +399,8 @@ def align_times(
             speed,
         )
     if vector < _MIN_VECTOR_CORRELATION:
-        axes = speed > 0.8
         return from_stamps(
-            "the angular speeds agree, their directions do not: the IMU's axes are not the layout file's"
-            if axes
-            else f"the angular rates do not correlate (speed {speed:.2f}, vector {vector:.2f})",
-            None,
-            speed,
+            f"the angular rates do not correlate (speed {speed:.2f}, vector {vector:.2f})", None, speed
         )
     rivals = [f for f in fits[1:] if abs(f.offset_s - best.offset_s) > 0.005 and _as_likely(f, best)]
     reason = ""
