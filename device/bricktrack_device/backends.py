@@ -14,12 +14,18 @@ def _open_sim(config: DeviceConfig) -> Rig:
         if e.name != "av":
             raise
         raise ConfigError(
-            "backend: 'sim' needs PyAV, which is not installed here; install it with pip install 'bricktrack[sim]'"
+            "backend: 'sim' needs PyAV, which is not installed here; run pip install 'bricktrack[sim]'"
         ) from e
     return SimRig(config.sim)
 
 
-BACKENDS: dict[str, Callable[[DeviceConfig], Rig]] = {"sim": _open_sim}
+def _open_hardware(config: DeviceConfig) -> Rig:
+    from bricktrack_device.hardware.pi_rig import PiRig
+
+    return PiRig(config)
+
+
+BACKENDS: dict[str, Callable[[DeviceConfig], Rig]] = {"hardware": _open_hardware, "sim": _open_sim}
 
 
 def open_rig(config: DeviceConfig) -> Rig:

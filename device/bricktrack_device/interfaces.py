@@ -105,7 +105,7 @@ class I2cBus(Protocol):
 
 
 BusOpener = Callable[[], I2cBus]
-"""Opens a bus. It passes to a spawned process as an argument, because each sampler opens its own bus there."""
+"""Opens a bus; passes to a spawned process as an argument, because each sampler opens its own bus."""
 
 
 class Rig(Protocol):

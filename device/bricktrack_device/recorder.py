@@ -297,7 +297,7 @@ class Recorder:
             raise RequestRefusedError(
                 "no-space",
                 f"{free / 1e6:.0f} MB are free in {self._store.folder}; a run of {duration_s:g} s needs "
-                f"{needed / 1e6:.0f} MB (twice its video and a margin). Pull and delete runs first",
+                f"{needed / 1e6:.0f} MB (twice its video and a margin). Make room there",
             )
         held = self._config.video_bytes(duration_s + RING_SLACK_S)
         available = _memory_available_bytes()

@@ -6,7 +6,9 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
+import adafruit_bno055
 import gpiozero
 from gpiozero.pins.mock import MockFactory
 
@@ -114,6 +116,8 @@ class FakeBusOpener:
     fail_every: int | None = None
 
     def __call__(self) -> I2cBus:
+        # Called in the sampler's process: there the driver need not wait 0.7 s for a table of registers.
+        adafruit_bno055.time = SimpleNamespace(sleep=lambda seconds: None)
         return FakeBus(
             present=self.present, hang_after=self.hang_after, exit_after=self.exit_after,
             fail_every=self.fail_every,
