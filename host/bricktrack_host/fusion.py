@@ -50,6 +50,8 @@ logger = logging.getLogger(__name__)
 _RUNS_AT_ONCE = 8  # 2000 nodes of four 21 x 21 matrices take 28 MB a run
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
+_MAX_SCALE_ROUNDS = 4
+_SCALE_STANDS = 1.25
 _CHI_3_MEDIAN = 1.538  # median of the root of chi-square with 3 degrees of freedom
 
 
@@ -247,27 +249,70 @@ def _relinearise(estimate: Estimate, b: int, n_nodes: int, settings: FusionSetti
 
 
 def _frame_chi2(
-    problem: Problem, estimate: Estimate, b: int, nodes: Nodes, used: BoolArray
+    problem: Problem, passed: Filter, estimate: Estimate, b: int, nodes: Nodes, used: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return how far each frame lies from what all the others say: rotation and position (3), and both (6).
 
-    The smoothed state holds the frame itself; with S = R - H P H' (R + H P H' where the frame was left out)
-    the residual is judged as if it did not.
+    The smoothed state holds the frame itself. Taken out of it again: with A = H P H', r the residual and R the
+    covariance that the filter gave the frame, the others alone leave R (R - A)^-1 r, and know the frame to
+    A + A (R - A)^-1 A.
     """
     at = nodes.node_of_frame
-    r_all, H_all = residuals(problem, estimate.state, at, b)
-    P = estimate.covariance[at, b]
-    HPH = H_all @ P @ np.swapaxes(H_all, -1, -2)
-    R = problem.cov_seen[at, b]
-    S = np.where(used[:, None, None], R - HPH, R + HPH)
-    # A frame that alone fixes the state leaves no residual: S near zero. Judge it by a share of R at least.
-    S = S + 0.02 * R
+    r, H = residuals(problem, estimate.state, at, b)
+    A = H @ estimate.covariance[at, b] @ np.swapaxes(H, -1, -2)
+    stated = problem.cov_seen[at, b]
+    given = stated * passed.inflation[at, b][:, None, None]
+    # A frame that alone fixes the state leaves no residual, and R - A near zero: judge it by a share of R.
+    rest = np.linalg.inv(1.02 * given - A)
+    out = used[:, None, None]
+    S = stated + np.where(out, A + A @ rest @ A, A)
+    r = np.where(used[:, None], (given @ rest @ r[..., None])[..., 0], r)
 
     def chi2(part: slice) -> FloatArray:
-        r = r_all[:, part]
-        return np.asarray((r * np.linalg.solve(S[:, part, part], r[..., None])[..., 0]).sum(axis=1))
+        e = r[:, part]
+        return np.asarray((e * np.linalg.solve(S[:, part, part], e[..., None])[..., 0]).sum(axis=1))
 
     return chi2(slice(0, 3)), chi2(slice(3, 6)), chi2(slice(0, 6))
+
+
+def _settle_noise(
+    runs: list[Run],
+    nodes: list[Nodes],
+    lins: list[Linearisation],
+    used: list[BoolArray],
+    settings: FusionSettings,
+) -> tuple[list[FloatArray], list[tuple[NoiseLevel, NoiseLevel]], Estimate, list[FloatArray]]:
+    """Return the optical noise scales and inertial noise levels of each run, and the pass made with them.
+
+    Optical noise understated by much lets the smoother follow the frames and hides itself, so the scale is
+    taken again until it stands; when it does at once, as it should, this is one pass.
+
+    Returns
+    -------
+    scales, levels, estimate, chi2
+    """
+    stated = NoiseLevel(settings.roughness_share, 1.0)
+    levels = [(stated, stated) for _ in runs]
+    scales = [np.ones(2) for _ in runs]
+    for _ in range(_MAX_SCALE_ROUNDS):
+        problem, parts = build_problem(
+            runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
+        )
+        if settings.adapt_noise:
+            levels = _choose_noise(problem, parts, settings)
+            problem, parts = build_problem(
+                runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
+            )
+        passed = Filter(problem)
+        estimate = passed.smooth()
+        chi2s = [_frame_chi2(problem, passed, estimate, b, nodes[b], used[b]) for b in range(len(runs))]
+        more = [np.sqrt([np.median(turn), np.median(shift)]) / _CHI_3_MEDIAN for turn, shift, _ in chi2s]
+        scales = [np.maximum(scale * m, 1.0) for scale, m in zip(scales, more, strict=True)]
+        if max(float(m.max()) for m in more) < _SCALE_STANDS:
+            break
+    # By the scales that have just been refined, not those the pass was made with.
+    both = [c[2] / max(float(m.max()), 1.0) ** 2 for c, m in zip(chi2s, more, strict=True)]
+    return scales, levels, estimate, both
 
 
 def _choose_noise(
@@ -302,46 +347,32 @@ def _fuse_together(
     runs = [_prepare(item) for item in inputs]
     lins = [first_linearisation(run, settings) for run in runs]
     used = [np.ones(len(run.t_cam_s), dtype=np.bool_) for run in runs]
-    scales = [np.ones(2) for _ in runs]
-    stated = NoiseLevel(settings.roughness_share, 1.0)
-    levels = [(stated, stated) for _ in runs]
-
-    def build() -> tuple[Problem, list[NoiseParts]]:
-        return build_problem(
-            runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
-        )
-
-    for second in (False, True):
-        nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
-        if not second:
-            lins = [
-                replace(lin, R_first=_attitude_at_first_node(run, node, lin))
-                for run, node, lin in zip(runs, nodes, lins, strict=True)
-            ]
-        problem, parts = build()
-        if not second and settings.adapt_noise:
-            levels = _choose_noise(problem, parts, settings)
-            problem, parts = build()
-        passed = Filter(problem)
-        estimate = passed.smooth()
-        chi2s = [_frame_chi2(problem, estimate, b, nodes[b], used[b]) for b in range(len(runs))]
-        if not second:
-            for b, (turn, shift, both) in enumerate(chi2s):
-                scales[b] = np.maximum(
-                    [np.sqrt(np.median(turn)) / _CHI_3_MEDIAN, np.sqrt(np.median(shift)) / _CHI_3_MEDIAN], 1.0
-                )
-                used[b] = both < settings.gate_chi2 * float(scales[b].max()) ** 2
-                if used[b].sum() < 0.5 * len(used[b]):
-                    used[b][:] = True  # then it is not the frames that are wrong
-            lins = [_relinearise(estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
+    nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
+    lins = [
+        replace(lin, R_first=_attitude_at_first_node(run, node, lin))
+        for run, node, lin in zip(runs, nodes, lins, strict=True)
+    ]
+    scales, levels, estimate, chi2 = _settle_noise(runs, nodes, lins, used, settings)
+    for b, far in enumerate(chi2):
+        good = far < settings.gate_chi2
+        used[b] = good if good.mean() > 0.5 else used[b]  # else it is not the frames that are wrong
+    # Relinearised once, with what the first pass found of clocks, noise and outliers.
+    lins = [_relinearise(estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
+    nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
+    problem, _ = build_problem(
+        runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
+    )
+    passed = Filter(problem)
+    estimate = passed.smooth()
+    chi2 = [_frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
     forward = passed.forward() if with_forward else None
     results = []
     for b, (item, run, node, lin) in enumerate(zip(inputs, runs, nodes, lins, strict=True)):
         n = len(node.t_s)
         x, P = estimate.state.x[:n, b], estimate.covariance[:n, b]
         n_frames = len(item.optical.t_ns)
-        chi2, rejected = np.full(n_frames, np.nan), np.zeros(n_frames, dtype=np.bool_)
-        chi2[run.frame], rejected[run.frame] = chi2s[b][2], ~used[b]
+        frame_chi2, rejected = np.full(n_frames, np.nan), np.zeros(n_frames, dtype=np.bool_)
+        frame_chi2[run.frame], rejected[run.frame] = chi2[b], ~used[b]
         if rejected.any():
             logger.warning("%d of %d optical poses left out as outliers", rejected.sum(), len(run.frame))
 
@@ -378,7 +409,7 @@ def _fuse_together(
                 acc_bias_sd_mps2=sd[BA],
                 gravity_camera_mps2=x[0, GRAV],
                 gravity_sd_mps2=sd[GRAV],
-                frame_chi2=chi2,
+                frame_chi2=frame_chi2,
                 frame_rejected=rejected,
                 mean_nis=float(np.nanmean(passed.nis[:, b])),
                 gyro_noise=levels[b][0],

@@ -7,7 +7,7 @@ gap the covariance grows with the fifth power of time, and poses too unsure are 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import uniform_filter1d
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import ShapeError, TrackingError
@@ -20,7 +20,6 @@ from bricktrack_host.tracks import FusedTrack, OpticalTrack
 _MIN_POSITION_SD_MM = 2e-3
 _MAX_TURN_RAD = 2.5  # rotation vectors from the middle attitude stay smooth below pi
 _INNOVATION_GATE = 63.0  # five times the 95 % point of chi-square with 6: real motion is not stationary
-_CHI2_6_MEDIAN = 5.35
 _NIS_CAP = 200.0  # so that an outlier does not choose the jerk
 _JERK_WINDOW_S = 0.5
 # Densities of white jerk tried, rad^2/s^5 and mm^2/s^5: from a brick at rest to 50 mm at 10 Hz.
@@ -37,7 +36,7 @@ class OpticalSmoothingSettings:
     optical_common_share : float
         Part of the optical sd that neighbouring frames have in common; added to the covariance given out.
     gate_chi2 : float
-        A frame farther from all the others than this is left out (6 degrees of freedom), if it stands alone.
+        A frame farther than this from its neighbours (6 degrees of freedom) is left out, if it stands alone.
     max_position_sd_mm, max_rotation_sd_rad : float
         A pose less sure than this is given as NaN.
     """
@@ -199,34 +198,56 @@ def smooth_optical(
     z, z_cov = np.concatenate([rvec, p_mm], axis=1), to_rvec @ cov @ np.swapaxes(to_rvec, 1, 2)
 
     t_frame = seconds_since(frame_ns, epoch_ns)
+    good = _good_frames(t_frame, z, z_cov, settings.gate_chi2)
+    frame_ns, t_frame, z, z_cov = frame_ns[good], t_frame[good], z[good], z_cov[good]
     jerk = _choose_jerk(t_frame, z, z_cov)
-    good = _good_frames(t_frame, z, z_cov, jerk, settings.gate_chi2)
-    t_ns, back = np.unique(np.concatenate([frame_ns[good], output_t_ns]), return_inverse=True)
+    t_ns, back = np.unique(np.concatenate([frame_ns, output_t_ns]), return_inverse=True)
     frame = np.full(len(t_ns), -1)
-    frame[back[: good.sum()]] = np.flatnonzero(good)
+    frame[back[: len(frame_ns)]] = np.arange(len(frame_ns))
     t_s = seconds_since(t_ns, epoch_ns)
     # In an interval between frames the livelier of its ends holds.
     after = np.clip(np.searchsorted(t_frame, t_s), 1, len(t_frame) - 1)
     node_jerk = np.maximum(jerk[after], jerk[after - 1])
     x, P = _Smoother(t_s, frame, z, z_cov, node_jerk[:, None]).smooth()
-    at = back[good.sum() :]
-    common = settings.optical_common_share**2 * np.median(cov, axis=0)
-    return _to_track(x[at, 0], P[at, 0], middle, output_t_ns, frame_ns[good], common, settings)
+    at = back[len(frame_ns) :]
+    common = settings.optical_common_share**2 * np.median(cov[good], axis=0)
+    return _to_track(x[at, 0], P[at, 0], middle, output_t_ns, frame_ns, common, settings)
 
 
-def _good_frames(
-    t_s: FloatArray, z: FloatArray, cov: FloatArray, jerk: FloatArray, gate_chi2: float
-) -> BoolArray:
-    """Return which frames agree with all the others, or at least disagree no more than their neighbours."""
-    x, P = _Smoother(t_s, np.arange(len(t_s)), z, cov, jerk[:, None]).smooth()
-    r = z - x[:, 0, :6]
-    S = 1.02 * cov - P[:, 0, :6, :6]
-    chi2 = (r * np.linalg.solve(S, r[..., None])[..., 0]).sum(axis=1)
-    # A brick that starts to shake strays from the mean jerk in many frames; an outlier stands out alone.
-    usual = np.maximum(median_filter(chi2, 15, mode="nearest") / _CHI2_6_MEDIAN, 1.0)
-    padded = np.concatenate([chi2[1:2], chi2, chi2[-2:-1]])
-    good = ~((chi2 > gate_chi2 * usual) & (chi2 > 4 * np.maximum(padded[:-2], padded[2:])))
-    return np.asarray(good if good.sum() >= max(3, 0.5 * len(good)) else np.ones(len(good), dtype=np.bool_))
+def _cubic_through(t_s: FloatArray, z: FloatArray, k: int, others: list[int]) -> FloatArray:
+    """Return what the cubic through four other frames says of frame k."""
+    t = t_s[others] - t_s[k]
+    weights = [np.prod([-t[j] / (t[i] - t[j]) for j in range(4) if j != i]) for i in range(4)]
+    return np.asarray(np.array(weights) @ z[others])
+
+
+def _good_frames(t_s: FloatArray, z: FloatArray, cov: FloatArray, gate_chi2: float) -> BoolArray:
+    """Return which frames are no lone outliers.
+
+    A frame far off the cubic through two neighbours on each side is one only if its neighbours agree with
+    theirs once it is left out: at an impact they do not, and the frame stays.
+    """
+    n = len(t_s)
+    good = np.ones(n, dtype=np.bool_)
+
+    def off(k: int, without: int) -> float:
+        around = [i for i in range(k - 3, k + 4) if i not in (k, without) and 0 <= i < n and good[i]]
+        before, after = [i for i in around if i < k], [i for i in around if i > k]
+        if len(before) < 2 or len(after) < 2:
+            return np.inf
+        e = z[k] - _cubic_through(t_s, z, k, before[-2:] + after[:2])
+        # The cubic's own noise adds 17/18 of a frame's variance on an even grid.
+        return float(e @ np.linalg.solve(2 * cov[k], e))
+
+    alone = np.array([off(k, k) for k in range(n)])
+    far = np.where(np.isfinite(alone), alone, 0.0)
+    for k in np.argsort(-far):
+        if far[k] < gate_chi2:
+            break
+        least = max(gate_chi2, 0.05 * far[k])
+        if all(off(j, int(k)) < least for j in (k - 1, k + 1) if 0 <= j < n):
+            good[k] = False
+    return good
 
 
 def _to_track(

@@ -231,6 +231,8 @@ class Filter:
     ----------
     nis : ndarray, shape (K, B)
         Innovation squared over its covariance, NaN where no frame.
+    inflation : ndarray, shape (K, B)
+        By how much the covariance of a surprising frame was enlarged.
     log_likelihood : ndarray, shape (B,)
         Of the frames given the past; what one frame can take away is bounded.
     """
@@ -247,6 +249,7 @@ class Filter:
         self._P_pred = np.empty_like(self.P)
         self._F = np.zeros((max(n_kept - 1, 0), n_runs, N_MOVING, N_STATES))
         self.nis = np.full((n_nodes, n_runs), np.nan)
+        self.inflation = np.ones((n_nodes, n_runs))
         self.log_likelihood = np.zeros(n_runs)
         self._run(keep)
 
@@ -316,8 +319,9 @@ class Filter:
         self.log_likelihood[runs] -= 0.5 * (log_det + np.minimum(nis, _NIS_CAP))
         # A frame beyond what S allows is believed less, in proportion: never refused, so that the filter
         # finds back after it has gone wrong itself. The second pass judges with hindsight.
-        inflate = np.maximum(nis / CHI2_6_95, 1.0)[:, None, None]
-        S = predicted + inflate * pr.cov_seen[k, runs]
+        inflation = np.maximum(nis / CHI2_6_95, 1.0)
+        self.inflation[k, runs] = inflation
+        S = predicted + inflation[:, None, None] * pr.cov_seen[k, runs]
         gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(PHt, -1, -2)), -1, -2)
         moved = _move(state, _matvec(gain, y))
         after = before - gain @ np.swapaxes(PHt, -1, -2)

@@ -94,7 +94,7 @@ def simulate_shake(
 
     smooth = CubicSpline(t, wander(amplitude_mm) * 1e-3)
     velocity = smooth(t, 1)
-    for centre in rng.uniform(1.5, duration_s - 1.8, impacts):
+    for centre in rng.uniform(1.5, duration_s - 1.8, impacts) if impacts else ():
         jump = rng.normal(0, 1, 3)
         jump *= impact_mps / np.linalg.norm(jump)
         # Up in 3 ms, back over the next 150 ms.
