@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.errors import CalibrationError, ShapeError
+from bricktrack_host.cut_dots import complete_cut_dot
 from bricktrack_host.neighbours import Neighbours, median_spacing
 
 GreyImage = NDArray[np.uint8]
@@ -29,6 +30,8 @@ MAX_AXIS_RATIO = 2.0
 """Longest to shortest axis: a target tilted by 60 degrees."""
 MIN_CONTRAST_GREY = 12.0
 """Least step from background to plateau, grey levels."""
+MIN_NOISE_GREY = 0.29
+"""What rounding to whole grey levels makes alone."""
 MIN_RELATIVE_CONTRAST = 0.15
 """A dot must show this share of the picture's strongest contrasts."""
 
@@ -46,7 +49,9 @@ class Dots:
     area_px2 : ndarray, shape (n,), px^2
         Zeroth moment of the normalised light.
     touches_border : ndarray of bool, shape (n,)
-        The picture's border cuts the dot or its blurred rim: the centroid is not that of the disc.
+        The picture's border cuts the dot or its blurred rim: the moments are not those of the disc.
+    is_completed : ndarray of bool, shape (n,)
+        A cut dot's centre was found from its visible rim after all (`bricktrack_host.cut_dots`).
     polarity : "white-on-black" or "black-on-white"
     """
 
@@ -54,6 +59,7 @@ class Dots:
     cov_px2: FloatArray
     area_px2: FloatArray
     touches_border: BoolArray
+    is_completed: BoolArray
     polarity: Polarity
 
     def __len__(self) -> int:
@@ -66,6 +72,7 @@ class Dots:
             self.cov_px2[keep],
             self.area_px2[keep],
             self.touches_border[keep],
+            self.is_completed[keep],
             self.polarity,
         )
 
@@ -89,7 +96,8 @@ def detect_dots(grey: GreyImage, *, polarity: Polarity = "auto", keep_cut_dots: 
     polarity : str, optional
         Which is the lighter; "auto" takes the one that yields clearly more dots.
     keep_cut_dots : bool, optional
-        Return dots at the border too, flagged by ``touches_border``.
+        Return all dots at the border too, flagged by ``touches_border``; otherwise only those whose
+        centre could be completed.
 
     Returns
     -------
@@ -128,7 +136,7 @@ def detect_dots(grey: GreyImage, *, polarity: Polarity = "auto", keep_cut_dots: 
             )
     chosen, light, regions = candidates[0]
     dots = _measure(light, regions, chosen)
-    return dots if keep_cut_dots else dots.select(~dots.touches_border)
+    return dots if keep_cut_dots else dots.select(~dots.touches_border | dots.is_completed)
 
 
 def _round_regions(light: NDArray[np.uint8]) -> _Regions:
@@ -216,12 +224,13 @@ class _Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moments:
-    """Light-weighted moments of one dot about a given point, and the blur of its rim."""
+    """Light-weighted moments of one dot about a given point (0th to 2nd), and the blur of its rim."""
 
     shift_px: FloatArray
     cov_px2: FloatArray
     area_px2: float
     blur_px: float
+    spread_px2: FloatArray
 
 
 def _measure(light: NDArray[np.uint8], regions: _Regions, polarity: Polarity) -> Dots:
@@ -262,7 +271,27 @@ def _measure(light: NDArray[np.uint8], regions: _Regions, polarity: Polarity) ->
     # With the rim cut at two sigma the centroid moves by some thousandths of a pixel only.
     touches = to_border < np.ceil(2 * blur)
     cov = np.array([m.cov_px2 for m in moments])
-    return Dots(uv[good], cov[good], area[good], touches[good], polarity)
+    completed = np.zeros(n, dtype=np.bool_)
+    whole = np.flatnonzero(good & ~touches)
+    if len(whole) >= 3:
+        guides = whole[Neighbours(middle[whole]).nearest(middle, 3)[1]]
+        for i in np.flatnonzero(good & touches):
+            near = guides[i]
+            spread = np.mean([moments[k].spread_px2 for k in near], axis=0)
+            away = middle[i] - middle[near[0]]
+            dot = complete_cut_dot(
+                *_normalised(
+                    patches[i], middle[i], levels[near[0]] + slopes[near[0]] @ away, slopes[near[0]]
+                ),
+                box_px=(left[i], top[i], left[i] + width[i] - 1, top[i] + height[i] - 1),
+                shape_px2=4 * (spread - blur**2 * np.eye(2)),
+                blur_px=float(blur),
+                noise=max(patches[near[0]].noise_grey, MIN_NOISE_GREY) / float(np.ptp(levels[near[0]])),
+                size_px=(columns, rows),
+            )
+            if dot is not None:
+                uv[i], cov[i], area[i], completed[i] = dot.uv_px, dot.cov_px2, area[near].mean(), True
+    return Dots(uv[good], cov[good], area[good], touches[good], completed[good], polarity)
 
 
 def _patch(light: NDArray[np.uint8], regions: _Regions, i: int, reach: int) -> _Patch:
@@ -309,22 +338,35 @@ def _moments(
     ``levels`` are background and plateau there, ``slopes`` their gradients (level, axis) in grey/px; the
     patch's own and none where not given.
     """
-    background, plateau = (patch.background_grey, patch.plateau_grey) if levels is None else levels
-    tilt = np.zeros((2, 2)) if slopes is None else slopes
-    v, u = np.nonzero(patch.disc)
-    d_uv = np.stack([u + patch.origin_px[0] - about_px[0], v + patch.origin_px[1] - about_px[1]])
-    dark = background + tilt[0] @ d_uv
-    step = np.maximum(plateau + tilt[1] @ d_uv - dark, MIN_CONTRAST_GREY / 2)
-    weight = (patch.light[patch.disc] - dark) / step
+    if levels is None or slopes is None:
+        levels, slopes = np.array([patch.background_grey, patch.plateau_grey]), np.zeros((2, 2))
+    uv, weight = _normalised(patch, about_px, levels, slopes)
+    d_uv = uv - about_px[:, None]
+    step = float(np.ptp(levels))
     total = float(weight.sum())
     if not total > 0:
-        return _Moments(np.full(2, np.nan), np.full((2, 2), np.nan), 0.0, np.nan)
+        return _Moments(np.full(2, np.nan), np.full((2, 2), np.nan), 0.0, np.nan, np.full((2, 2), np.nan))
     shift = d_uv @ weight / total
-    # Rounding to whole grey levels alone makes a noise of 0.29.
-    lever = (d_uv - shift[:, None]) * (max(patch.noise_grey, 0.29) / step)
+    d_uv -= shift[:, None]
+    lever = d_uv * (max(patch.noise_grey, MIN_NOISE_GREY) / step)
     # Across an edge blurred by a Gaussian, weight (1 - weight) integrates to sigma / sqrt(pi).
     blur = float((weight * (1 - weight)).sum()) * np.sqrt(np.pi) / (2 * np.sqrt(np.pi * total))
-    return _Moments(shift, lever @ lever.T / total**2, total, blur)
+    return _Moments(shift, lever @ lever.T / total**2, total, blur, (weight * d_uv) @ d_uv.T / total)
+
+
+def _normalised(
+    patch: _Patch, about_px: FloatArray, levels: FloatArray, slopes: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the pixels of the dot and its rim, (2, n), and their light from background 0 to plateau 1.
+
+    ``levels`` are background and plateau at ``about_px``, ``slopes`` their gradients (level, axis), grey/px.
+    """
+    v, u = np.nonzero(patch.disc)
+    uv = np.stack([u + patch.origin_px[0], v + patch.origin_px[1]]).astype(np.float64)
+    d_uv = uv - about_px[:, None]
+    dark = levels[0] + slopes[0] @ d_uv
+    step = np.maximum(levels[1] + slopes[1] @ d_uv - dark, MIN_CONTRAST_GREY / 2)
+    return uv, (patch.light[patch.disc] - dark) / step
 
 
 def _level_slopes(centre: FloatArray, levels: FloatArray, *, trusted: BoolArray) -> FloatArray:

@@ -54,7 +54,7 @@ def assign_grid(
     Parameters
     ----------
     dots : Dots
-        Those that touch the border are left out.
+        Cut ones are left out unless their centre was completed.
     pitch_mm : float, mm
         Distance of neighbouring dots.
     columns, rows : int
@@ -76,7 +76,7 @@ def assign_grid(
             f"target of {columns} x {rows} dots at {pitch_mm:g} mm: expected two or more columns and rows "
             "and a positive pitch"
         )
-    dots = dots.select(~dots.touches_border)
+    dots = dots.select(~dots.touches_border | dots.is_completed)
     if len(dots) < MIN_DOTS:
         raise CalibrationError(
             f"{len(dots)} whole dots found, expected at least {MIN_DOTS} of the {columns} x {rows}; "

@@ -1,8 +1,9 @@
 """From the dots of target pictures to the ray model that serves best, with what speaks for the choice.
 
-Gross outliers are taken out, the centroids corrected for the discs' bias, the order found by leaving
+Gross outliers are taken out and the centroids corrected for the discs' bias. The order is found by leaving
 out blocks of dots and predicting them (a random choice of dots would be surrounded by others and say nothing
-of the rim), and central rays tested against the two-plane model that has them as a special case.
+of the rim), together with what the dots' scatter makes of the places without dots. Central rays are tested
+against the two-plane model that has them as a special case.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ from bricktrack_host.disc_bias import disc_bias_px, disc_diameter_mm
 from bricktrack_host.dot_observations import DotObservations
 from bricktrack_host.irt import PAPER_ORDER, TwoPlaneIrt, fit_two_plane_irt
 from bricktrack_host.neighbours import median_spacing
-from bricktrack_host.pixel_polynomials import PixelScaling, least_squares, monomials, n_terms
+from bricktrack_host.pixel_polynomials import PixelScaling, least_squares, monomials, n_terms, picture_grid
 
 ModelKind = Literal["central", "two-plane"]
 ModelWish = Literal["auto", "central", "two-plane"]
@@ -55,15 +56,21 @@ class CrossValidatedError(msgspec.Struct, frozen=True, kw_only=True, forbid_unkn
     rms_um : float, um
         Over the left-out dots of all planes, each as seen by the fit without its block.
     max_um : float, um
-    fold_rms_um : tuple of float, um
-        The same, fold by fold.
+    picture_noise_um : float, um
+        What the dots' scatter makes of the fit over the whole picture, on all planes, root mean square. It
+        grows fast where there are no dots and the order is high.
     """
 
     model: ModelKind
     order: int
     rms_um: float
     max_um: float
-    fold_rms_um: tuple[float, ...]
+    picture_noise_um: float
+
+    @property
+    def expected_um(self) -> float:
+        """Error to expect over the whole picture, among dots and beyond; orders are chosen by it."""
+        return float(np.hypot(self.rms_um, self.picture_noise_um))
 
 
 class ModelChoice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -240,7 +247,9 @@ def choose_model(
         only_paper = model == "two-plane" and order is None and PAPER_ORDER in orders
         for q in (PAPER_ORDER,) if only_paper else orders:
             candidates.append(cross_validate(planes, kind, q, sensor_mode=sensor_mode))
-    best = {kind: _simplest_of_the_best([c for c in candidates if c.model == kind]) for kind in kinds}
+    best = {
+        kind: min((c for c in candidates if c.model == kind), key=lambda c: c.expected_um) for kind in kinds
+    }
     if len(kinds) == 1:
         chosen = best[kinds[0]]
         why = f"{chosen.model} as asked" if model != "auto" else "central: more than two planes"
@@ -253,7 +262,7 @@ def choose_model(
                 if order is not None
                 else "as in the paper"
                 if model == "two-plane"
-                else "predicts left-out dots best"
+                else "is expected to err least"
             ),
             candidates=tuple(candidates),
         )
@@ -314,27 +323,17 @@ def cross_validate(
             for (_, dots), fold in zip(planes, folds, strict=True)
         ]
     distance_um = 1e3 * np.hypot(*np.concatenate(errors).T)
-    fold = np.concatenate(folds)
+    fitted = _fit(planes, kind, order, sensor_mode)
+    everywhere = picture_grid(sensor_mode)
+    # Of x and of y, hence the 2.
+    variance = [2 * np.mean(fitted.point_sd_mm(everywhere, z) ** 2) for z, _ in planes]
     return CrossValidatedError(
         model=kind,
         order=order,
         rms_um=float(np.sqrt(np.mean(distance_um**2))),
         max_um=float(distance_um.max()),
-        fold_rms_um=tuple(float(np.sqrt(np.mean(distance_um[fold == k] ** 2))) for k in np.unique(fold)),
+        picture_noise_um=float(1e3 * np.sqrt(np.mean(variance))),
     )
-
-
-def _simplest_of_the_best(candidates: Sequence[CrossValidatedError]) -> CrossValidatedError:
-    """Return the lowest order whose error exceeds the least by no more than that difference's standard error.
-
-    Beyond the dots a higher order that fits equally well errs more.
-    """
-    best = min(candidates, key=lambda c: c.rms_um)
-    for candidate in sorted(candidates, key=lambda c: c.order):
-        excess = np.square(candidate.fold_rms_um) - np.square(best.fold_rms_um)
-        if excess.mean() <= excess.std(ddof=1) / np.sqrt(len(excess)):
-            return candidate
-    return best
 
 
 def _fit(planes: Planes, kind: ModelKind, order: int, mode: SensorMode) -> CentralRays | TwoPlaneIrt:

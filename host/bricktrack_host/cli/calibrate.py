@@ -316,12 +316,17 @@ def _report(fitted: RayCalibration, *, names: list[str], simulated: bool) -> Non
     console.print(table)
 
     candidates = Table(title="Error at dots left out of the fit")
-    for heading in ("model", "order", "rms um", "max um", ""):
+    for heading in ("model", "order", "rms um", "max um", "noise over the picture um", ""):
         candidates.add_column(heading, justify="left" if heading in ("model", "") else "right")
     for c in choice.candidates:
         taken = (c.model, c.order) == (choice.model, choice.order)
         candidates.add_row(
-            c.model, str(c.order), f"{c.rms_um:.2f}", f"{c.max_um:.2f}", "taken" if taken else ""
+            c.model,
+            str(c.order),
+            f"{c.rms_um:.2f}",
+            f"{c.max_um:.2f}",
+            f"{c.picture_noise_um:.2f}",
+            "taken" if taken else "",
         )
     console.print(candidates)
     console.print(f"Model: {choice.reason}")

@@ -50,8 +50,8 @@ def test_the_sample_is_calibrated_and_reported(fitted):
     assert (calibration.unit, calibration.focus_note) == ("sample", "f/2")
     assert calibration.simulated
     assert "simulated" in output
-    # The sample's README: 490 whole dots at A, of which those that just touch the border may go; 576 at B.
-    assert 470 <= calibration.images[0].n_dots_found <= 490
+    # The sample's README: 490 whole dots at A (some 40 more have their centre in the picture); 576 at B.
+    assert 485 <= calibration.images[0].n_dots_found <= 530
     assert calibration.images[1].n_dots_found == 576
     assert (
         calibration.images[0].sha256
@@ -101,8 +101,8 @@ def test_the_rays_are_true_over_the_whole_picture(fitted):
         )
         rows = rows[np.all((rows[:, :2] >= 0) & (rows[:, :2] <= [1919, 1079]), axis=1)]
         error_um = 1e3 * np.hypot(*(model.points_on_plane(rows[:, :2], z_mm) - rows[:, 2:]).T)
-        assert error_um.mean() < 2.0
-        assert error_um.max() < 20.0
+        assert error_um.mean() < 1.5
+        assert error_um.max() < 15.0
 
 
 def test_wrong_input_is_named(tmp_path):

@@ -140,16 +140,40 @@ def test_uneven_light_does_not_pull_the_centres(blur_px):
     assert np.sqrt(np.mean(error**2)) < 0.03
 
 
-def test_cut_dots_are_kept_only_on_request():
-    scene = draw(columns=32, rows=18)
-    every = detect_dots(scene.grey, keep_cut_dots=True)
+@pytest.fixture(scope="module")
+def overfull():
+    """A target larger than the picture, and all dots found, cut or not."""
+    scene = draw(columns=40, rows=24)
+    return scene, detect_dots(scene.grey, keep_cut_dots=True)
+
+
+def test_cut_dots_are_told_apart_and_kept_only_on_request(overfull):
+    scene, every = overfull
     cut = every.touches_border
-    assert cut.sum() > 10
-    np.testing.assert_array_equal(every.uv_px[~cut], detect_dots(scene.grey).uv_px)
-    # None of those believed is cut, and cutting moved none of them.
-    kept = every.select(~cut)
-    assert scene.whole[matched(kept, scene)].all()
-    assert np.abs(kept.uv_px - scene.centroid_px[matched(kept, scene)]).max() < 0.05
+    assert cut.sum() > 40
+    usual = detect_dots(scene.grey)
+    np.testing.assert_array_equal(usual.uv_px, every.uv_px[~cut | every.is_completed])
+    # None of those believed whole is cut, and the border moved none of them.
+    whole = every.select(~cut)
+    assert scene.whole[matched(whole, scene)].all()
+    assert np.abs(whole.uv_px - scene.centroid_px[matched(whole, scene)]).max() < 0.05
+
+
+def test_centres_of_cut_dots_are_completed_from_the_visible_rim(overfull):
+    scene, every = overfull
+    completed = every.select(every.is_completed)
+    assert every.touches_border[every.is_completed].all()
+    assert len(completed) > 15
+    true = matched(completed, scene)
+    error = completed.uv_px - scene.centroid_px[true]
+    # Radius 8 px. The centroid of what is visible would be off by pixels: see the next lines.
+    assert np.sqrt(np.mean(error**2)) < 0.07
+    assert np.abs(error).max() < 0.2
+    margin = np.minimum(scene.centroid_px[true], [WIDTH - 1, HEIGHT - 1] - scene.centroid_px[true]).min(
+        axis=1
+    )
+    assert margin.min() < 5.0  # some are cut by more than three pixels
+    assert margin.min() > 1.0  # none has its centre at the border: too little would be seen of it
 
 
 def test_a_picture_without_dots_is_refused():
