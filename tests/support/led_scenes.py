@@ -26,7 +26,11 @@ COLUMN = {0: (0.0, 0.0, 0.0), 3: (0.0, 15.0, 0.0), 4: (0.0, 26.0, 0.0), 5: (0.0,
 def seven_leds(collar_mm: float | None = None) -> BrickModel:
     """A layout of the paper's kind: a column of four, one LED out of the plane, two on the other side."""
     places = {**COLUMN, 1: (24.0, 4.0, 12.0), 2: (51.0, 12.0, 0.0), 6: (54.0, 48.0, 0.0)}
-    axes = {i: (_S, 0.0, -_C) for i in COLUMN} | {1: (0.0, 0.0, -1.0), 2: (-_S, 0.0, -_C), 6: (-_S, 0.0, -_C)}
+    axes = dict.fromkeys(COLUMN, (_S, 0.0, -_C)) | {
+        1: (0.0, 0.0, -1.0),
+        2: (-_S, 0.0, -_C),
+        6: (-_S, 0.0, -_C),
+    }
     leds = [LedEntry(name=f"m{i}", position_mm=places[i], axis=axes[i], radius_mm=3.0) for i in range(7)]
     profile = None if collar_mm is None else ProfileEntry(collar_mm=collar_mm, source="test")
     return brick_model_from_file(LayoutFile(name="test", led=leds, led_profile=profile), where="test")
@@ -99,7 +103,7 @@ def draw_disc(
 ) -> None:
     """Add an ellipse of light to a linear picture, supersampled, smeared along a straight line."""
     reach = np.ceil(np.array(radii) + np.abs(smear) / 2 + 3).astype(int)
-    u0, v0 = (int(round(c)) for c in centre)
+    u0, v0 = (round(c) for c in centre)
     fine = (np.arange(oversampling) + 0.5) / oversampling - 0.5
     u = (np.arange(u0 - reach[0], u0 + reach[0] + 1)[:, None] + fine).ravel()
     v = (np.arange(v0 - reach[1], v0 + reach[1] + 1)[:, None] + fine).ravel()

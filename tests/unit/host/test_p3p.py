@@ -25,7 +25,7 @@ def test_one_of_the_poses_is_the_true_one():
 def test_every_pose_brings_the_points_onto_the_rays():
     rng = np.random.default_rng(3)
     points = rng.uniform(-30, 30, (200, 3, 3))
-    X = points + [0.0, 0.0, 140.0]
+    X = points + np.array([0.0, 0.0, 140.0])
     bearing = X / np.linalg.norm(X, axis=-1, keepdims=True)
     R, t, valid = solve_p3p(bearing, points)
     Y = np.einsum("nkij,nlj->nkli", R, points) + t[:, :, None]
@@ -36,7 +36,7 @@ def test_every_pose_brings_the_points_onto_the_rays():
 
 def test_points_in_a_line_give_nothing():
     points = np.array([[[0.0, 0, 0], [0, 10, 0], [0, 25, 0]]])
-    X = points + [3.0, -9.0, 140.0]
+    X = points + np.array([3.0, -9.0, 140.0])
     assert not solve_p3p(X / np.linalg.norm(X, axis=-1, keepdims=True), points)[2].any()
 
 

@@ -102,14 +102,25 @@ def test_any_led_serves_as_the_reference():
 
 
 def test_frames_with_their_own_sets_of_leds_are_solved_together():
-    R, t = orientations_within(10.0, 7, seed=7)  # further out a hidden LED may cost the convergence
+    R, t = orientations_within(30.0, 7, seed=7)
     a, b = hits(R, t)
-    for i in range(7):
+    for i in (0, 1, 3, 4, 5, 6):
         a[i, i] = b[i, i] = np.nan
     found = solve(a, b)
     # Without m1 the six others lie in one plane.
     assert found.converged.tolist() == [True, False, True, True, True, True, True]
     assert np.isnan(found.t_camera_brick_mm[1]).all()
+    np.testing.assert_allclose(found.t_camera_brick_mm[found.converged], t[found.converged], atol=1e-4)
+
+
+def test_without_m2_the_iteration_converges_to_false_poses_without_a_sign():
+    # Why poses of frames with hidden LEDs are verified and started elsewhere too (optical_track).
+    R, t = orientations_within(30.0, 300, seed=1)
+    a, b = hits(R, t)
+    a[:, 2] = np.nan
+    found = solve(a, b)
+    error = np.linalg.norm(found.t_camera_brick_mm - t, axis=1)
+    assert (error[found.converged] > 1.0).mean() > 0.1
 
 
 def test_three_leds_give_no_pose():

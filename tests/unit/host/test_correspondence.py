@@ -1,0 +1,161 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from led_scenes import leds_in_camera, random_poses, seven_leds
+from pinhole import PinholeCamera
+
+from bricktrack_common.brick_model import LayoutFile, LedEntry, brick_model_from_file
+from bricktrack_host.correspondence import (
+    assign_predicted,
+    identify_by_paper,
+    is_paper_layout,
+    paper_correspondence,
+    search_correspondence,
+)
+from bricktrack_host.segment import Blobs
+
+CAMERA = PinholeCamera()
+BRICK = seven_leds()
+RADIUS_PX = 34.0
+
+
+def blobs_at(uv, area=np.pi * RADIUS_PX**2 * 0.8):
+    n = len(uv)
+    return Blobs(
+        uv_px=np.asarray(uv, dtype=float),
+        cov_px2=np.broadcast_to(0.0036 * np.eye(2), (n, 2, 2)),
+        area_px2=np.full(n, area),
+        eccentricity=np.full(n, 0.3),
+        fill=np.full(n, 1.0),
+        flags=np.zeros(n, dtype=np.int64),
+    )
+
+
+def picture(R, t, *, seed, hidden=(), n_false=0, brick=BRICK):
+    """Shuffled blobs of one pose, with their LEDs' numbers, -1 for false ones."""
+    rng = np.random.default_rng(seed)
+    uv = CAMERA.project(leds_in_camera(R[None], t[None], brick)).uv_px[0]
+    led = np.array([i for i in range(brick.n_leds) if i not in hidden])
+    points = np.vstack(
+        [uv[led] + rng.normal(0, 0.3, (len(led), 2)), rng.uniform([60, 60], [1860, 1020], (n_false, 2))]
+    )
+    led = np.append(led, np.full(n_false, -1))
+    order = rng.permutation(len(led))
+    return blobs_at(points[order]), led[order]
+
+
+def check(found, led, *, at_least):
+    for k, blob in enumerate(found.blob_of_led):
+        assert blob == -1 or led[blob] == k, (found, led)
+    assert found.n_found >= at_least
+
+
+@pytest.mark.parametrize(
+    ("hidden", "n_false"), [((), 0), ((), 4), ((0,), 3), ((1,), 0), ((2,), 3), ((0, 5), 2)]
+)
+def test_leds_are_identified_from_nothing(hidden, n_false):
+    R, t = random_poses(4, seed=hash((hidden, n_false)) % 1000, tilt_deg=30.0)
+    for i in range(4):
+        blobs, led = picture(R[i], t[i], seed=i, hidden=hidden, n_false=n_false)
+        found = search_correspondence(blobs, CAMERA, BRICK, collar_mm=None)
+        check(found, led, at_least=7 - len(hidden))
+
+
+def test_four_leds_alone_are_identified_or_called_ambiguous_but_never_mistaken():
+    R, t = random_poses(12, seed=21, tilt_deg=25.0)
+    n_found = 0
+    for i in range(12):
+        blobs, led = picture(R[i], t[i], seed=i, hidden=(0, 4, 5))
+        found = search_correspondence(blobs, CAMERA, BRICK, collar_mm=None)
+        check(found, led, at_least=0)
+        n_found += found.n_found == 4
+    assert n_found >= 4
+
+
+def test_a_layout_that_looks_the_same_turned_round_is_ambiguous():
+    square = [(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (40.0, 40.0, 0.0), (0.0, 40.0, 0.0), (20.0, 20.0, -15.0)]
+    leds = [
+        LedEntry(name=f"s{i}", position_mm=p, axis=(0.0, 0.0, -1.0), radius_mm=3.0)
+        for i, p in enumerate(square)
+    ]
+    brick = brick_model_from_file(LayoutFile(led=leds), where="test")
+    blobs, _ = picture(np.eye(3), np.array([-20.0, -20.0, 140.0]), seed=1, brick=brick)
+    found = search_correspondence(blobs, CAMERA, brick, collar_mm=None)
+    assert found.is_ambiguous
+    assert found.n_found == 0
+    assert "equally well" in found.reason
+
+
+def test_reflections_alone_are_no_brick():
+    rng = np.random.default_rng(5)
+    found = search_correspondence(
+        blobs_at(rng.uniform([60, 60], [1860, 1020], (6, 2))), CAMERA, BRICK, collar_mm=None
+    )
+    # Four points can pass by chance for a brick far aside; six do not.
+    assert found.n_found <= 4
+    few = search_correspondence(blobs_at(np.array([[5.0, 5.0]])), CAMERA, BRICK, collar_mm=None)
+    assert few.n_found == 0 and "four are needed" in few.reason
+
+
+def test_the_likeliest_of_many_blobs_are_searched():
+    R, t = random_poses(1, seed=31)
+    blobs, led = picture(R[0], t[0], seed=2, n_false=18)
+    odd = led < 0
+    blobs = replace(blobs, area_px2=np.where(odd, 300.0, blobs.area_px2), fill=np.where(odd, 0.7, 1.0))
+    check(search_correspondence(blobs, CAMERA, BRICK, collar_mm=None), led, at_least=7)
+
+
+def test_the_pattern_is_found_again_after_a_jump_over_several_leds():
+    R, t = random_poses(1, seed=41)
+    uv = CAMERA.project(leds_in_camera(R, t, BRICK)).uv_px[0]
+    jump = np.array([-180.0, 140.0])  # the column's LEDs are 130 to 240 px apart
+    blobs = np.vstack([uv + jump, [[1500.0, 90.0], [200.0, 500.0]]])
+    assigned = assign_predicted(blobs, uv, gate_px=50.0, shift_limit_px=340.0)
+    assert assigned.tolist() == list(range(7))
+    assert (assign_predicted(blobs[:0], uv, gate_px=50.0, shift_limit_px=340.0) == -1).all()
+    far = assign_predicted(uv + 900.0, uv, gate_px=50.0, shift_limit_px=100.0)
+    assert (far == -1).all()
+
+
+def test_a_hidden_led_stays_unassigned():
+    R, t = random_poses(1, seed=42)
+    uv = CAMERA.project(leds_in_camera(R, t, BRICK)).uv_px[0]
+    assigned = assign_predicted(np.delete(uv, 3, axis=0) + 20.0, uv, gate_px=50.0, shift_limit_px=340.0)
+    assert assigned.tolist() == [0, 1, 2, -1, 3, 4, 5]
+
+
+def test_the_papers_rules_identify_its_layout():
+    R, t = random_poses(60, seed=51, tilt_deg=20.0)
+    right = 0
+    for i in range(60):
+        blobs, led = picture(R[i], t[i], seed=i)
+        # Exact points: the blobs' noise of 0.3 px bends a column of 15 mm by a tenth of a degree.
+        answer = paper_correspondence(CAMERA.points_on_plane(blobs.uv_px, 130.0))
+        right += answer is not None and (led[answer] == np.arange(7)).all()
+    assert right >= 57
+
+
+def test_distortion_bends_the_column_out_of_the_papers_limit_in_raw_pixels():
+    camera = PinholeCamera(k1=-0.35, k2=0.1)
+    t = np.array([[-45.0, -24.0, 120.0]])
+    uv = camera.project(leds_in_camera(np.eye(3)[None], t, BRICK)).uv_px[0]
+    assert paper_correspondence(uv) is None
+    calibrated = paper_correspondence(camera.points_on_plane(uv, 130.0))
+    assert calibrated is not None
+    assert calibrated.tolist() == list(range(7))
+
+
+def test_the_papers_rules_are_believed_only_after_reprojection():
+    R, t = random_poses(1, seed=61)
+    blobs, led = picture(R[0], t[0], seed=3, n_false=2)
+    found = identify_by_paper(blobs, CAMERA, BRICK, collar_mm=None, gate_px=12.0)
+    check(found, led, at_least=7)
+    broken = replace(blobs, uv_px=blobs.uv_px + np.where((led == 6)[:, None], 90.0, 0.0))
+    assert identify_by_paper(broken, CAMERA, BRICK, collar_mm=None, gate_px=12.0).n_found == 0
+
+
+def test_the_papers_layout_is_recognised():
+    assert is_paper_layout(BRICK)
+    bent = replace(BRICK, led_positions_mm=BRICK.led_positions_mm + np.eye(7)[3][:, None] * [3.0, 0, 0])
+    assert not is_paper_layout(bent)
