@@ -16,7 +16,7 @@ def _open_sim(config: DeviceConfig) -> Rig:
         raise ConfigError(
             "backend: 'sim' needs PyAV, which is not installed here; run pip install 'bricktrack[sim]'"
         ) from e
-    return SimRig(config.sim)
+    return SimRig(config.sim, config.camera)
 
 
 def _open_hardware(config: DeviceConfig) -> Rig:
