@@ -139,9 +139,9 @@ def fit_edges(edges_ns: ArrayLike, nominal_hz: float | None = None) -> EdgeFit:
     Raises
     ------
     ShapeError
-        If there are fewer than five edges, or they do not increase.
+        If they are no whole numbers, or do not increase.
     EdgeFitError
-        If they are no wave of this frequency.
+        If there are fewer than five edges, or they are no wave of this frequency.
 
     Examples
     --------
@@ -150,10 +150,11 @@ def fit_edges(edges_ns: ArrayLike, nominal_hz: float | None = None) -> EdgeFit:
     (5000.0, [3], 16000)
     """
     edges = np.asarray(edges_ns)
-    if edges.ndim != 1 or edges.size < MIN_EDGES or not np.issubdtype(edges.dtype, np.integer):
+    if edges.size < MIN_EDGES:
+        raise EdgeFitError(f"{edges.size} edges; a line through the square wave needs at least {MIN_EDGES}")
+    if edges.ndim != 1 or not np.issubdtype(edges.dtype, np.integer):
         raise ShapeError(
-            f"edges_ns has shape {edges.shape} and type {edges.dtype}; expected at least {MIN_EDGES} whole "
-            "numbers of nanoseconds"
+            f"edges_ns has shape {edges.shape} and type {edges.dtype}; expected (any,) whole nanoseconds"
         )
     edges = edges.astype(np.int64)
     steps = np.diff(edges)

@@ -181,6 +181,7 @@ def spectrum_figure(result: RunResult) -> Figure | None:
     if track is None:
         return None
     inside = track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) == 0
+    inside &= np.isfinite(track.t_camera_brick_mm).all(axis=1)
     if np.count_nonzero(inside) < 64:
         return None
     t_s = (track.t_ns[inside] - track.t_ns[inside][0]) / 1e9
@@ -233,7 +234,7 @@ def _six(
 def mark_events(ax: Axes, axis: TimeAxis, result: RunResult, figures: KeyFigures) -> None:
     """Shade the dropouts, and mark trigger and impacts."""
     for n, (first, last) in enumerate(axis.s(figures.dropouts_ns).tolist()):
-        ax.axvspan(first, last, color=SHADE, lw=0, label="no optical pose" if n == 0 else None)
+        ax.axvspan(first, last, color=SHADE, lw=0, label="no optical pose used" if n == 0 else None)
     for n, t_s in enumerate(axis.s(figures.impacts_ns).tolist()):
         ax.axvline(t_s, color=IMPACT, lw=0.8, alpha=0.75, label="impact" if n == 0 else None)
     if result.t0_ns is not None:

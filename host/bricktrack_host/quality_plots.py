@@ -35,11 +35,12 @@ def residual_time_figure(result: RunResult) -> Figure:
     t_s = axis.s(result.optical.t_ns)
     residual = result.optical.residual_px
     limit = _limit(residual, 0.25)
+    size = float(np.clip(60 / np.sqrt(max(len(t_s), 1)), 2.4, 4.5))
     for i, name in enumerate(result.led_names):
         colour = LED_COLOURS[i % len(LED_COLOURS)]
         for k in (0, 1):
             y = residual[:, i, k]
-            axes[k].plot(t_s, y, ".", ms=2.4, mew=0, color=colour, label=name)
+            axes[k].plot(t_s, y, ".", ms=size, mew=0, color=colour, label=name)
             beyond = np.abs(y) > limit
             axes[k].plot(t_s[beyond], np.sign(y[beyond]) * limit * 0.97, "x", ms=4, color=colour)
     for k, name in ((0, "u, px"), (1, "v, px")):
@@ -107,7 +108,8 @@ def timing_figure(result: RunResult, figures: KeyFigures) -> Figure:
     else:
         axes[1].plot(axis.s(result.imu.t_ns), late_us / 1000, ".", ms=2, mew=0, color=FUSED)
         axes[1].set_ylabel("after slot, ms")
-        axes[1].set_ylim(bottom=0)
+        if np.nanmin(late_us, initial=0.0) >= 0:
+            axes[1].set_ylim(bottom=0)
     axes[2].set_title("Square wave: edge less fitted line")
     fit = result.edge_fit
     if fit is None:
@@ -131,8 +133,11 @@ def imu_lateness_us(result: RunResult) -> FloatArray | None:
     """Return how long after its slot each inertial sample was taken, us; NaN in gaps."""
     if result.imu is None or not result.manifest.imus or not len(result.imu.t_ns):
         return None
-    grid = result.manifest.imus[0]
+    chosen = result.provenance.settings.get("imu")
+    grid = next((i for i in result.manifest.imus if i.name == chosen), result.manifest.imus[0])
     after_ns = (result.imu.t_ns - grid.latency_ns - grid.t0_ns) % grid.period_ns
+    if result.manifest.origin == "import":  # the grid was made from the stamps: half of them come before it
+        after_ns = np.where(after_ns > grid.period_ns // 2, after_ns - grid.period_ns, after_ns)
     usable = result.imu.flags & int(UNUSABLE) == 0
     return np.asarray(np.where(usable, after_ns / 1000.0, np.nan))
 
@@ -214,7 +219,8 @@ def calibration_figure(calibration: CalibrationPicture, uv_px: FloatArray | None
         ax.add_patch(Polygon(outline, closed=True, fc="#dce8dd", ec=TRUTH, lw=0.9, alpha=0.8, zorder=0,
                              label="covered by dots" if n == 0 else None))  # fmt: skip
     dots = calibration.dots_uv_px
-    ax.plot(dots[:, 0], dots[:, 1], ".", ms=2, mew=0, color=INK, label="dots")
+    if len(dots):
+        ax.plot(dots[:, 0], dots[:, 1], ".", ms=2, mew=0, color=INK, label="dots")
     residual = calibration.residual_um
     if residual is not None and np.isfinite(residual).any():
         size = np.hypot(residual[:, 0], residual[:, 1])

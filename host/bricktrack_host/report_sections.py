@@ -116,7 +116,7 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
         words = "No rest pose: position of the first LED and rotation vector in the camera frame."
     whole = _embed(
         motion_figure(result, figures), "Time histories of three displacements and three rotations",
-        "Line: fused motion with its 95 % band. Dots: optical poses. Shaded: no optical pose. Red: impacts.",
+        "Line: fused motion, 95 % band. Dots: optical poses. Shaded: no optical pose used. Red: impacts.",
     )  # fmt: skip
     section = Section("motion", "Motion", [words], [whole])
     span = _closeup(result, figures)
@@ -266,7 +266,21 @@ def _embed(figure: Figure, alt: str, caption: str = "", *, half: bool = False) -
 def in_words(name: str) -> str:
     """Return a key as words, its unit behind a comma: ``offset_ms`` as ``offset, ms``."""
     words, _, unit = name.rpartition("_")
-    if words and unit in {"ms", "us", "ns", "s", "ppm", "um", "mm", "px", "hz", "deg", "mps2", "radps"}:
+    if words and unit in {
+        "ms",
+        "us",
+        "ns",
+        "s",
+        "ppm",
+        "um",
+        "mm",
+        "px",
+        "hz",
+        "deg",
+        "mps2",
+        "radps",
+        "dps",
+    }:
         return f"{words.replace('_', ' ')}, {unit}"
     return name.replace("_", " ")
 

@@ -7,10 +7,11 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.imu_records import UNUSABLE
 from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results import RunResult
 from bricktrack_host.tracks import FusedTrack
 
+POOR_RESIDUAL_PX = 0.5  # several times what centroids of sharp dots and LEDs scatter, about 0.06 px
 GAP_PERIODS = 1.5  # a longer time between two frame stamps is a dropped frame
 
 
@@ -26,7 +27,8 @@ class KeyFigures:
         Frame records; frames missing between them; frames with an optical pose.
     frame_period_ns : float
     dropouts_ns : ndarray of int64, shape (k, 2)
-        First and last instant without an optical pose, between the first and the last one.
+        Times between optical poses further apart than one and a half frame periods, and times that the
+        fusion flags as dropouts because it did not believe the poses there.
     impacts_ns : ndarray of int64, shape (k,)
     residual_rms_px : float
         Distance between seen and predicted LED, root mean square over LEDs used.
@@ -90,17 +92,19 @@ def key_figures(result: RunResult) -> KeyFigures:
     squares = squares[np.isfinite(squares)]
     speed = speed[np.isfinite(speed)]
     impacts = np.empty(0, dtype=np.int64)
+    dropouts_ns = _without_pose(optical.t_ns, has_pose, period_ns)
     if track is not None:
-        impacts = (
-            _intervals(track.t_ns, track.flags & int(PoseFlag.IMPACT) != 0).mean(axis=1).astype(np.int64)
-        )
+        unbelieved = _intervals(track.t_ns, track.flags & int(PoseFlag.DROPOUT) != 0)
+        dropouts_ns = _merged(np.concatenate([dropouts_ns, unbelieved]))
+        struck = _intervals(track.t_ns, track.flags & int(PoseFlag.IMPACT) != 0)
+        impacts = struck[:, 0] + (struck[:, 1] - struck[:, 0]) // 2
     return KeyFigures(
         duration_s=float((stamps[-1] - stamps[0]) / 1e9) if len(stamps) else 0.0,
         n_frames=len(stamps),
         n_frames_dropped=int(missing.sum()),
         n_poses=int(has_pose.sum()),
         frame_period_ns=period_ns,
-        dropouts_ns=_without_pose(optical.t_ns, has_pose, period_ns),
+        dropouts_ns=dropouts_ns,
         impacts_ns=impacts,
         residual_rms_px=float(np.sqrt(squares.mean())) if squares.size else float("nan"),
         peak_mm=peak_mm,
@@ -120,10 +124,11 @@ def verdict(result: RunResult, figures: KeyFigures) -> tuple[str, list[str]]:
         problems.insert(0, "no pose could be had from any frame")
     elif not result.fused:
         problems.insert(0, "no fused motion: the poses are from the camera alone")
+    problems += _flag_problems(result, figures)
     if result.rest is None:
         problems.append("no rest pose: displacements from rest are not given")
     if result.edge_fit is not None:
-        problems += [p for p in result.edge_fit.problems() if p not in problems]
+        problems += [p for p in result.edge_fit.problems() if not any(p in said for said in problems)]
     share = figures.n_poses / figures.n_frames if figures.n_frames else 0.0
     tracked = f"{figures.n_poses} of {figures.n_frames} frames gave a pose ({100 * share:.1f} %)"
     if not figures.n_poses:
@@ -136,14 +141,34 @@ def verdict(result: RunResult, figures: KeyFigures) -> tuple[str, list[str]]:
     return line + ".", problems
 
 
-def pose_flag_counts(flags: IntArray) -> dict[PoseFlag, int]:
-    """Return how often each `PoseFlag` bit is set."""
-    return {f: int(np.count_nonzero(flags & int(f))) for f in PoseFlag if int(f)}
+def _flag_problems(result: RunResult, figures: KeyFigures) -> list[str]:
+    """Return in words what the flags and residuals say of the run as a whole."""
+    flags = result.optical.flags
 
+    def count(bit: PoseFlag) -> int:
+        return int(np.count_nonzero(flags & int(bit)))
 
-def led_flag_counts(flags: IntArray) -> dict[LedFlag, int]:
-    """Return how often each `LedFlag` bit is set."""
-    return {f: int(np.count_nonzero(flags & int(f))) for f in LedFlag if int(f)}
+    found = []
+    if figures.residual_rms_px > POOR_RESIDUAL_PX:
+        found.append(
+            f"LEDs lie {figures.residual_rms_px:.2f} px rms from where the poses put them, where 0.1 px is "
+            "usual: check the layout, the calibration and the LED profile"
+        )
+    if count(PoseFlag.LED_PROFILE_UNKNOWN):
+        found.append(
+            "the shape of these LEDs was never fitted: a bias of some 0.1 mm is possible. Run 'bricktrack "
+            "calibrate leds'"
+        )
+    if n := count(PoseFlag.UNCOVERED):
+        found.append(f"{n} poses use rays where the calibration had no dots and extrapolates")
+    if n := count(PoseFlag.AMBIGUOUS):
+        found.append(f"in {n} frames more than one pose fitted; none is given there")
+    if n := count(PoseFlag.UNVERIFIED):
+        found.append(f"in {n} frames too few LEDs were seen to check which is which")
+    track = main_track(result)
+    if track is not None and (n := int(np.count_nonzero(track.flags & int(PoseFlag.CLIPPED)))):
+        found.append(f"the inertial sensor was at its range limit in {n} samples")
+    return found
 
 
 def _without_pose(t_ns: IntArray, has_pose: BoolArray, period_ns: float) -> IntArray:
@@ -155,12 +180,22 @@ def _without_pose(t_ns: IntArray, has_pose: BoolArray, period_ns: float) -> IntA
     return np.stack([seen[far], seen[far + 1]], axis=1)
 
 
-def _intervals(t_ns: IntArray, mask: BoolArray) -> FloatArray:
+def _merged(intervals_ns: IntArray) -> IntArray:
+    """Return the union of intervals as intervals in order of time."""
+    merged: list[list[int]] = []
+    for first, last in sorted(intervals_ns.tolist()):
+        if merged and first <= merged[-1][1]:
+            merged[-1][1] = max(merged[-1][1], last)
+        else:
+            merged.append([first, last])
+    return np.array(merged, dtype=np.int64).reshape(-1, 2)
+
+
+def _intervals(t_ns: IntArray, mask: BoolArray) -> IntArray:
     """Return first and last instant of each stretch of set samples, shape (k, 2)."""
     edges = np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))
     first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    # Half the sum of two times of hours stays exact in float64 to better than a microsecond.
-    return np.stack([t_ns[first], t_ns[last]], axis=1).astype(np.float64)
+    return np.stack([t_ns[first], t_ns[last]], axis=1)
 
 
 def _largest(values: FloatArray) -> FloatArray:

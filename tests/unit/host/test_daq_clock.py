@@ -119,8 +119,13 @@ def test_noise_is_refused():
 
 @pytest.mark.parametrize(
     ("edges", "words"),
-    [([1, 2, 3], "at least 5"), ([1, 2, 3, 3, 4], "edge 3 does not"), ([0.0, 1.0, 2.0, 3.0, 4.0], "float64")],
+    [([1, 2, 3, 3, 4], "edge 3 does not"), ([0.0, 1.0, 2.0, 3.0, 4.0], "float64")],
 )
 def test_what_is_no_train_is_named(edges, words):
     with pytest.raises(ShapeError, match=words):
         fit_edges(np.array(edges))
+
+
+def test_too_few_edges_are_said_to_be_too_few():
+    with pytest.raises(EdgeFitError, match="4 edges; .* at least 5"):
+        fit_edges(square_wave(4, period_ns=5e6))

@@ -183,3 +183,24 @@ def test_write_replaces_the_file_whole_and_says_why_it_cannot(result, tmp_path, 
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(StorageError, match="cannot be written"):
         write_report(result, tmp_path / "no" / "report.html")
+
+
+def test_flags_of_the_whole_run_become_words(result):
+    optical = result.optical
+    flags = optical.flags | int(PoseFlag.LED_PROFILE_UNKNOWN)
+    flags[:7] |= int(PoseFlag.UNCOVERED)
+    blurred = replace(result, optical=replace(optical, flags=flags, residual_px=optical.residual_px * 20))
+    _, problems = verdict(blurred, key_figures(blurred))
+    said = " ".join(problems)
+    assert f"LEDs lie {20 * key_figures(result).residual_rms_px:.2f} px" in said
+    assert "never fitted" in said
+    assert "7 poses use rays" in said
+
+
+def test_poses_that_the_fusion_did_not_believe_count_as_time_without_a_pose(result):
+    track = result.fused["imu"]
+    flags = track.flags.copy()
+    flags[1000:1010] |= int(PoseFlag.DROPOUT)
+    f = key_figures(replace(result, fused={"imu": replace(track, flags=flags)}))
+    assert len(f.dropouts_ns) == 3
+    assert [track.t_ns[1000], track.t_ns[1009]] in f.dropouts_ns.tolist()
