@@ -1,0 +1,105 @@
+"""The ``[sim]`` table of the configuration: which world the simulated sensors live in."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+_NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+_Positive = Annotated[float, msgspec.Meta(gt=0)]
+_Count = Annotated[int, msgspec.Meta(ge=0)]
+Interval = tuple[_NotNegative, _Positive]
+"""Start after the first edge, and duration, s."""
+
+
+class HiddenLed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One LED that something stands before for a while; seconds after the first edge."""
+
+    name: str
+    start_s: _NotNegative
+    duration_s: _Positive
+
+
+class SimFaults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[sim.faults]``: what the simulated hardware does wrong, on purpose.
+
+    Attributes
+    ----------
+    drop_frame_every : int
+        Every n-th frame never leaves the camera; 0 for none.
+    camera_dies_after_s : float or None
+        Frames stop coming so long after the start, as when picamera2's thread dies.
+    imu_nack_every, imu_nack_errno : int
+        Every n-th transaction fails with this error number.
+    imu_reset_s, imu_stuck_s : float or None
+        The sensor resets itself silently, or repeats itself for ever, so long after the first edge.
+    imu_absent : bool
+        Nothing answers on the bus.
+    missed_edges : list of int
+        Numbers of rising edges that the unit never hears of; 0 is the first.
+    """
+
+    drop_frame_every: _Count = 0
+    camera_dies_after_s: _NotNegative | None = None
+    imu_nack_every: _Count = 0
+    imu_nack_errno: int = 121
+    imu_reset_s: _NotNegative | None = None
+    imu_stuck_s: _NotNegative | None = None
+    imu_absent: bool = False
+    missed_edges: list[_Count] = []
+
+
+class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[sim]``: one seeded world; the same settings give the same shake.
+
+    Attributes
+    ----------
+    seed : int
+        Of everything random: phases, noise, sensor biases.
+    layout : str, path
+        Layout file of the brick; ``""``: the kit's own, the paper's seven LEDs.
+    motion : "sines", "sweep", "impacts" or "csv"
+        Sines of 2 to 20 Hz; a sweep through these; sines with an impact every second or so; or the motion in
+        ``motion_csv`` (columns ``t_s, x_mm, y_mm, z_mm`` and, if wanted, ``rx_deg, ry_deg, rz_deg``).
+    amplitude_mm, amplitude_deg : float
+        Largest displacement and rotation along an axis, roughly.
+    shake_delay_s : float
+        From arming to the first rising edge.
+    quiet_s, shake_s : float
+        Rest after the first edge, then shake.
+    square_wave_hz : float
+        By the laboratory's clock, which the unit's differs from by ``clock_ppm``.
+    edge_jitter_us : float
+        Of the stamps, standard deviation.
+    dropouts : list of (start_s, duration_s)
+        When an opaque card hides the whole view, after the first edge.
+    hidden_leds : list of HiddenLed
+    collar_mm : float
+        Length of the lit cylinder behind each dome.
+    led_level : float
+        Brightness of the LEDs in linear light; 1 just fills the sensor, more saturates it.
+    clutter : float
+        Brightness of the surroundings and of reflections, 0 for a black box.
+    noise : float
+        Times the ordinary shot and read noise.
+    faults : SimFaults
+    """
+
+    seed: int = 1
+    layout: str = ""
+    motion: Literal["sines", "sweep", "impacts", "csv"] = "impacts"
+    motion_csv: str = ""
+    amplitude_mm: _NotNegative = 3.0
+    amplitude_deg: _NotNegative = 2.0
+    shake_delay_s: _Positive = 1.0
+    quiet_s: _NotNegative = 1.0
+    shake_s: _Positive = 12.0
+    square_wave_hz: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 200.0
+    clock_ppm: float = 20.0
+    edge_jitter_us: _NotNegative = 5.0
+    dropouts: list[Interval] = []
+    hidden_leds: list[HiddenLed] = []
+    collar_mm: _NotNegative = 0.7
+    led_level: _Positive = 0.9
+    clutter: _NotNegative = 1.0
+    noise: _NotNegative = 1.0
+    faults: SimFaults = SimFaults()

@@ -1,0 +1,89 @@
+"""All simulated hardware of one unit, around one world."""
+
+import json
+import platform
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import gpiozero
+import msgspec
+import numpy as np
+
+from bricktrack_common.rotations import continuous_quaternions, quaternion_from_matrix
+from bricktrack_common.run_manifest import TRUTH_NAME
+from bricktrack_device.interfaces import BusOpener, Camera
+from bricktrack_device.sim.sim_camera import SimCamera
+from bricktrack_device.sim.sim_i2c import ACC_LAG_S, GYRO_LAG_S, SimBusOpener
+from bricktrack_device.sim.sim_pins import SquareWave, make_factory
+from bricktrack_device.sim.world import SimWorld, make_epoch
+
+if TYPE_CHECKING:
+    from bricktrack_device.config import CameraTable
+    from bricktrack_device.sim.settings import SimSettings
+
+_TRUTH_STEP_NS = 1_000_000
+
+
+class SimRig:
+    """A simulated unit, meeting `interfaces.Rig`."""
+
+    simulated = True
+
+    def __init__(self, settings: "SimSettings", camera: "CameraTable") -> None:
+        self._settings = settings
+        self._camera = camera
+        self._epoch = make_epoch()
+        self.world = SimWorld(settings, self._epoch)
+        self._factory = make_factory()
+        self._wave = SquareWave(self.world, self._factory)
+
+    def open_camera(self) -> Camera:
+        """Return the camera, not yet started."""
+        return SimCamera(self.world, self._camera)
+
+    def pin_factory(self) -> gpiozero.Factory:
+        """Return the mock factory whose pins the square wave drives."""
+        return self._factory
+
+    def bus_opener(self, bus: str) -> BusOpener:
+        """Return what opens the simulated bus, whatever it is called."""
+        return SimBusOpener(self._settings, self._epoch)
+
+    def on_armed(self, t_armed_ns: int) -> None:
+        """Let the table start: schedule the first edge, and drive the line from there on."""
+        self._wave.stop()
+        self.world.schedule(t_armed_ns)
+        self._wave.start()
+
+    def write_truth(self, folder: Path, *, start_ns: int, end_ns: int) -> Path | None:
+        """Write the true motion between two instants, 1 kHz, as ``truth.npz``."""
+        t_ns = np.arange(start_ns, end_ns + 1, _TRUTH_STEP_NS, dtype=np.int64)
+        R, t_mm = self.world.pose(t_ns)
+        omega, v = self.world.twist(t_ns)
+        first = self.world.first_edge_ns or 0
+        dropouts = [
+            (first + round(start * 1e9), first + round((start + length) * 1e9))
+            for start, length in self._settings.dropouts
+        ]
+        path = folder / TRUTH_NAME
+        np.savez_compressed(
+            path,
+            t_ns=t_ns,
+            q_wxyz_camera_brick=continuous_quaternions(quaternion_from_matrix(R)),
+            t_camera_brick_mm=t_mm,
+            omega_brick_radps=omega,
+            v_camera_mmps=v,
+            dropouts_ns=np.array(dropouts, dtype=np.int64).reshape(-1, 2),
+            gravity_camera_mps2=self.world.gravity_camera_mps2,
+            imu_lags_s=np.array([ACC_LAG_S, GYRO_LAG_S]),
+            settings_json=np.array(json.dumps(msgspec.to_builtins(self._settings))),
+        )
+        return path
+
+    def describe(self) -> dict[str, str]:
+        """Return what the manifest says of the hardware: that there is none."""
+        return {"model": "simulated unit", "kernel": platform.release(), "machine": platform.machine()}
+
+    def close(self) -> None:
+        """Stop the table."""
+        self._wave.stop()

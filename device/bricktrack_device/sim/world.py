@@ -1,0 +1,145 @@
+"""The world that every simulated sensor asks: where the brick is, what hides it, when the wave rises.
+
+It is a deterministic function of its settings and of CLOCK_MONOTONIC; only the instant of the first edge is shared
+between processes, because arming decides it.
+"""
+
+import multiprocessing
+from dataclasses import dataclass
+from multiprocessing.sharedctypes import Synchronized
+from pathlib import Path
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.brick_model import BrickModel, brick_model_from_file, load_brick_model
+from bricktrack_common.rotations import matrix_from_rvec, right_jacobian, skew
+from bricktrack_device.sim.motions import make_motion
+from bricktrack_device.sim.paper_layout import PAPER_LAYOUT
+from bricktrack_device.sim.settings import SimSettings
+
+_REST_T_MM = np.array([-28.3, -23.5, 128.0])
+_REST_RVEC_RAD = np.array([-0.0227, 0.0140, -0.0122])
+_GRAVITY_CAMERA_MPS2 = matrix_from_rvec(np.array([0.0364, 0.0, 0.0279])) @ np.array([0.0, 9.80665, 0.0])
+_STEP_S = 1e-5
+
+Epoch = Synchronized  # of an int64: the first edge, ns; 0 until the unit is armed
+
+
+def make_epoch() -> "Epoch[int]":
+    """Return the shared instant of the first edge, not yet set; it passes to a spawned process as an argument."""
+    epoch: Epoch[int] = multiprocessing.get_context("spawn").Value("q", 0)
+    return epoch
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inertial:
+    """What an ideal inertial sensor at the lever arm feels, in its own axes."""
+
+    specific_force_mps2: FloatArray
+    omega_radps: FloatArray
+
+
+class SimWorld:
+    """The brick's motion and the table's square wave.
+
+    Parameters
+    ----------
+    settings : SimSettings
+    epoch : Epoch
+        Shared between the camera's, the sampler's and the trigger's views of the world.
+    """
+
+    def __init__(self, settings: SimSettings, epoch: "Epoch[int]") -> None:
+        self.settings = settings
+        self.brick = load_layout(settings)
+        self._epoch = epoch
+        self._motion = make_motion(settings)
+        self._R_rest = matrix_from_rvec(_REST_RVEC_RAD)
+
+    @property
+    def first_edge_ns(self) -> int | None:
+        """The instant of the first rising edge, CLOCK_MONOTONIC; `None` until the unit was armed."""
+        return int(self._epoch.value) or None
+
+    def schedule(self, t_armed_ns: int) -> int:
+        """Set the first edge after arming, and return it."""
+        first = t_armed_ns + round(self.settings.shake_delay_s * 1e9)
+        self._epoch.value = first
+        return first
+
+    def since_first_edge_s(self, t_ns: IntArray) -> FloatArray:
+        """Return seconds after the first edge; minus infinity while there is none."""
+        first = self.first_edge_ns
+        if first is None:
+            return np.full(np.shape(t_ns), -np.inf)
+        return np.asarray((np.asarray(t_ns, dtype=np.int64) - first) * 1e-9)
+
+    def _coordinates(self, since_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        t = np.where(np.isfinite(since_s), since_s, -1.0) - self.settings.quiet_s
+        return self._motion(np.asarray(t, dtype=np.float64))
+
+    def pose(self, t_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return ``R_camera_brick`` (n, 3, 3) and ``t_camera_brick_mm`` (n, 3) at instants (n,)."""
+        q, _, _ = self._coordinates(self.since_first_edge_s(t_ns))
+        return self._R_rest @ matrix_from_rvec(q[:, 3:]), _REST_T_MM + q[:, :3]
+
+    def twist(self, t_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the angular rate in brick axes, rad/s, and the origin's velocity in camera axes, mm/s."""
+        q, dq, _ = self._coordinates(self.since_first_edge_s(t_ns))
+        return _omega(q, dq), dq[:, :3]
+
+    def inertial(self, since_s: FloatArray) -> Inertial:
+        """Return the ideal inertial signals at times (n,) after the first edge, s."""
+        q, dq, ddq = self._coordinates(since_s)
+        omega = _omega(q, dq)
+        # The derivative of the right Jacobian by a central difference: h^2 times its third derivative, 1e-8.
+        before, after = (self._coordinates(since_s + s) for s in (-_STEP_S, _STEP_S))
+        alpha = (_omega(*after[:2]) - _omega(*before[:2])) / (2 * _STEP_S)
+        R = self._R_rest @ matrix_from_rvec(q[:, 3:])
+        lever_arm_m = _lever_arm_mm(self.brick) * 1e-3
+        swing = skew(alpha) @ lever_arm_m + (skew(omega) @ skew(omega)) @ lever_arm_m
+        force_brick = np.einsum("nji,nj->ni", R, ddq[:, :3] * 1e-3 - _GRAVITY_CAMERA_MPS2) + swing
+        R_brick_imu = np.eye(3) if self.brick.R_brick_imu is None else self.brick.R_brick_imu
+        return Inertial(force_brick @ R_brick_imu, omega @ R_brick_imu)
+
+    def view_is_covered(self, t_ns: IntArray) -> BoolArray:
+        """Tell when the opaque card hides everything."""
+        s = self.since_first_edge_s(t_ns)
+        covered = np.zeros(np.shape(s), dtype=np.bool_)
+        for start, duration in self.settings.dropouts:
+            covered |= (s >= start) & (s < start + duration)
+        return covered
+
+    def hidden_leds(self, t_ns: int) -> set[str]:
+        """Return the names of LEDs that something stands before."""
+        s = float(self.since_first_edge_s(np.array([t_ns]))[0])
+        return {h.name for h in self.settings.hidden_leds if h.start_s <= s < h.start_s + h.duration_s}
+
+    def edge_times_ns(self, first: int, last: int) -> IntArray:
+        """Return the true instants of the rising edges ``first`` to ``last`` - 1 on the unit's clock."""
+        start = self.first_edge_ns
+        if start is None:
+            return np.empty(0, dtype=np.int64)
+        period_ns = 1e9 / self.settings.square_wave_hz * (1 + self.settings.clock_ppm * 1e-6)
+        return np.asarray(start + np.rint(np.arange(first, last) * period_ns).astype(np.int64))
+
+    @property
+    def gravity_camera_mps2(self) -> FloatArray:
+        """Gravity in camera axes; about along +y, down in the picture."""
+        return np.asarray(_GRAVITY_CAMERA_MPS2.copy())
+
+
+def load_layout(settings: SimSettings) -> BrickModel:
+    """Return the layout of the simulated brick."""
+    if settings.layout:
+        return load_brick_model(Path(settings.layout))
+    return brick_model_from_file(PAPER_LAYOUT, where="the simulated brick")
+
+
+def _lever_arm_mm(brick: BrickModel) -> FloatArray:
+    return np.zeros(3) if brick.imu_lever_arm_mm is None else brick.imu_lever_arm_mm
+
+
+def _omega(q: FloatArray, dq: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nij,nj->ni", right_jacobian(q[:, 3:]), dq[:, 3:]))
