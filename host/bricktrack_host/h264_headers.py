@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from bricktrack_common.errors import VideoError
-from bricktrack_host.annex_b import NAL_IDR, NAL_SLICE, NAL_SPS, Buffer, iter_nal_units
+from bricktrack_host.annex_b import NAL_IDR, NAL_SLICE, NAL_SPS, Buffer, NalUnit, iter_nal_units
 
 _HIGH_PROFILES = (100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135)
 _SPS_BYTES = 400
 _SLICE_HEADER_BYTES = 24
+_B_SLICE, _I_SLICE = 1, 2
 
 Order = Literal["follows", "gap", "unreadable"]
 
@@ -22,6 +23,7 @@ class SequenceParameters:
     """What of a sequence parameter set is needed to read a slice header."""
 
     log2_max_frame_num: int
+    max_references: int
     gaps_allowed: bool
     separate_colour_planes: bool
     frames_only: bool
@@ -98,11 +100,12 @@ def parse_sequence_parameters(nal: bytes) -> SequenceParameters:
         bits.se()
         for _ in range(bits.ue()):
             bits.se()
-    bits.ue()
+    max_references = bits.ue()
     gaps_allowed = bits.u(1) == 1
     bits.ue()
     bits.ue()
-    return SequenceParameters(log2_max_frame_num, gaps_allowed, separate, bits.u(1) == 1)
+    frames_only = bits.u(1) == 1
+    return SequenceParameters(log2_max_frame_num, max_references, gaps_allowed, separate, frames_only)
 
 
 def _skip_scaling_list(bits: _Bits, size: int) -> None:
@@ -141,11 +144,16 @@ class PictureOrder:
         self._last_reference: int | None = None
 
     def check(self, unit: Buffer) -> tuple[Order, bool]:
-        """Return how an access unit follows the one before, and whether it is an IDR picture.
+        """Return how an access unit follows the one before, and whether prediction begins anew with it.
 
         ``"gap"`` means that a picture which this one may be predicted from is not in the stream (7.4.3,
         ``frame_num``). ``"unreadable"`` means that the unit has no slice or no parameter set.
+
+        Prediction begins anew with an IDR picture, and with an intra picture where the sequence keeps but
+        one reference: it takes the place of all earlier ones.
         """
+        first: tuple[NalUnit, SliceHeader | None] | None = None
+        all_intra = True
         for nal in iter_nal_units(unit):
             if nal.nal_type == NAL_SPS:
                 try:
@@ -155,27 +163,49 @@ class PictureOrder:
                 except VideoError:
                     return "unreadable", False
             elif nal.nal_type in (NAL_SLICE, NAL_IDR):
-                return self._check_slice(
-                    bytes(unit[nal.header : nal.header + _SLICE_HEADER_BYTES]),
-                    is_idr=nal.nal_type == NAL_IDR,
-                    is_reference=nal.ref_idc != 0,
-                )
-        return "unreadable", False
+                header = self._slice_header(unit, nal)
+                if first is None:
+                    first = nal, header
+                    if nal.nal_type == NAL_IDR or header is None or header.slice_type != _I_SLICE:
+                        break
+                elif header is None or header.slice_type != _I_SLICE:
+                    all_intra = False
+                    break
+        if first is None:
+            return "unreadable", False
+        nal, header = first
+        if header is None:
+            return "unreadable", nal.nal_type == NAL_IDR
+        return self._check_picture(nal, header, all_intra=all_intra)
 
-    def _check_slice(self, nal: bytes, *, is_idr: bool, is_reference: bool) -> tuple[Order, bool]:
+    def _slice_header(self, unit: Buffer, nal: NalUnit) -> SliceHeader | None:
+        if self.sequence is None:
+            return None
+        try:
+            return parse_slice_header(
+                bytes(unit[nal.header : nal.header + _SLICE_HEADER_BYTES]), self.sequence
+            )
+        except VideoError:
+            return None
+
+    def _check_picture(self, nal: NalUnit, header: SliceHeader, *, all_intra: bool) -> tuple[Order, bool]:
         sequence = self.sequence
         if sequence is None:
-            return "unreadable", is_idr
-        try:
-            header = parse_slice_header(nal, sequence)
-        except VideoError:
-            return "unreadable", is_idr
-        self.n_b_pictures += header.slice_type == 1
+            return "unreadable", False
+        self.n_b_pictures += header.slice_type == _B_SLICE
+        is_idr, last = nal.nal_type == NAL_IDR, self._last_reference
+        alone = (
+            header.slice_type == _I_SLICE
+            and all_intra
+            and nal.ref_idc != 0
+            and sequence.max_references <= 1
+            and last is not None  # a decoder does not start at such a picture
+        )
         order: Order = "follows"
-        if not is_idr and not sequence.gaps_allowed:
-            last = self._last_reference
-            if last is None or header.frame_num != (last + 1) % (1 << sequence.log2_max_frame_num):
-                order = "gap"
-        if is_reference:
+        if not (is_idr or alone or sequence.gaps_allowed) and (
+            last is None or header.frame_num != (last + 1) % (1 << sequence.log2_max_frame_num)
+        ):
+            order = "gap"
+        if nal.ref_idc != 0:
             self._last_reference = header.frame_num
-        return order, is_idr
+        return order, is_idr or alone

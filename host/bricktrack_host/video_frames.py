@@ -113,7 +113,7 @@ class _Decoding:
         self._frames = frames
         self._cut: dict[int, str] = {}  # never fed
         self._gaps: set[int] = set()  # predicted from a picture that the file does not hold
-        self._keyframes: set[int] = set()
+        self._restarts: set[int] = set()
         self._order = PictureOrder()
         self._next = 0
         self._chain = ""  # why pictures until the next keyframe are lost; empty while all is well
@@ -129,11 +129,11 @@ class _Decoding:
                 self._cut[i] = f"the video file ends at byte {size}, before this frame does"
                 continue
             unit = data[offset : offset + n_bytes]  # one packet's copy, which the decoder then owns
-            follows, is_idr = self._order.check(unit)
+            follows, is_restart = self._order.check(unit)
             if follows == "gap":
                 self._gaps.add(i)
-            if is_idr:
-                self._keyframes.add(i)
+            if is_restart and self._frames.keyframe[i]:  # both: one alone may be a damaged header
+                self._restarts.add(i)
             packet = av.Packet(unit)
             packet.pts = packet.dts = i
             try:
@@ -172,7 +172,7 @@ class _Decoding:
                 yield self._lose(self._next, "its bytes are damaged: the decoder gave no picture")
             if frame.is_corrupt:
                 yield self._lose(i, "its bytes are damaged: the decoder had to conceal")
-            elif i in self._gaps or (self._chain and i not in self._keyframes):
+            elif i in self._gaps or (self._chain and i not in self._restarts):
                 yield self._lose(i, "")
             else:
                 yield self._found(i, frame)
@@ -201,7 +201,7 @@ class _Decoding:
         )
 
     def _lose(self, i: int, reason: str) -> DecodedFrame:
-        if i in self._keyframes:
+        if i in self._restarts:
             self._chain = ""
         if i in self._cut:
             reason = self._cut.pop(i)

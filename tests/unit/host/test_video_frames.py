@@ -1,5 +1,6 @@
 """Every picture stands with its own record, whatever happens to its neighbours."""
 
+import av
 import numpy as np
 import pytest
 from small_videos import HEIGHT, PERIOD_US, WIDTH, grey_of, write_video
@@ -186,3 +187,40 @@ def test_leaving_early_closes_the_file(video):
     frames = decode_run_video(*video)
     assert next(frames).index == 0
     frames.close()
+
+
+def write_cut_scenes(path, refs):
+    """Encode two scenes; at the cut, picture 16, x264 puts an intra picture that is no IDR."""
+    draw = np.random.default_rng(0)
+    options = f"keyint=200:min-keyint=100:scenecut=80:ref={refs}:repeat-headers=1"
+    with av.open(str(path), "w", format="h264") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.options = {"bf": "0", "crf": "18", "preset": "fast", "threads": "1", "x264-params": options}
+        for i in range(N):
+            if i % 16 == 0:
+                picture = draw.integers(20, 220, (HEIGHT * 3 // 2, WIDTH)).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(picture, format="yuv420p")
+            frame.pts = i
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    assert split_access_units(path.read_bytes())[16].keyframe is False
+
+
+@pytest.mark.parametrize(
+    ("refs", "keyframe", "lost"),
+    [(1, True, list(range(11, 16))), (3, True, list(range(11, N))), (1, False, list(range(11, N)))],
+    ids=["one reference", "three references", "not said to be a keyframe"],
+)
+def test_an_intra_picture_ends_the_loss_only_if_nothing_can_look_past_it(tmp_path, refs, keyframe, lost):
+    path = tmp_path / "video.h264"
+    write_cut_scenes(path, refs)
+    frames = frame_times(path)
+    frames.keyframe[16] = keyframe
+    clean = [f.picture.luma.copy() for f in decode_run_video(path, frames)]
+    damage(path, frames, 11, lambda b: bytes(len(b)))
+    seen = {f.index: f.picture for f in decode_run_video(path, frames)}
+    assert [i for i, p in seen.items() if p is None] == lost
+    assert all(
+        np.array_equal(f.picture.luma, clean[f.index]) for f in decode_run_video(path, frames) if f.picture
+    )
