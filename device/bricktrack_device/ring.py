@@ -105,7 +105,7 @@ class VideoCut:
     records : list of FrameRecord
         One a packet.
     n_dropped : int
-        Frames missing between the first and the last, told by gaps over 1.5 periods.
+        Frames missing from the first picture to the window's end, told by gaps over 1.5 periods.
     n_without_metadata : int
     problems : list of str
     """
@@ -175,9 +175,12 @@ def cut_video(
         late_ms = (cut[0].abs_us - start_us) / 1000
         problems.append(f"video: begins {late_ms:.1f} ms after the run's window")
     silent_us = end_us - cut[-1].abs_us
-    if silent_us > GAP_PERIODS * period:
-        problems.append(f"video: ends {silent_us / 1000:.1f} ms before the run's window")
     n_dropped = 0
+    if silent_us > GAP_PERIODS * period:
+        if ordered[-1].abs_us > end_us:  # the camera went on: frames are missing across the window's end
+            n_dropped = int(silent_us / period)
+        else:
+            problems.append(f"video: ends {silent_us / 1000:.1f} ms before the run's window")
     n_without = 0
     offset = 0
     records: list[FrameRecord] = []

@@ -95,6 +95,12 @@ def test_a_stream_that_begins_late_or_ends_early_says_so() -> None:
     assert "ends" in early.problems[0] and early.packets[-1] is packets[39]
 
 
+def test_frames_missing_across_the_end_of_the_window_are_drops() -> None:
+    packets, metadata = stream(60, skip=(39, 40, 41, 42))
+    got = cut(packets, metadata, at(20), at(41) + 1000)
+    assert got.packets[-1].abs_us == at(38) // 1000 and got.problems == [] and got.n_dropped == 3
+
+
 def test_no_keyframe_in_reach_gives_an_empty_cut_in_words() -> None:
     packets, metadata = stream(30)
     headless = [EncodedPacket(p.abs_us, False, p.data) for p in packets]
