@@ -173,7 +173,10 @@ class _Problem:
         below, _ = predict_brick(R, t, self._rays, self._brick, collar_mm=low)
         above, _ = predict_brick(R, t, self._rays, self._brick, collar_mm=high)
         slope = (above.uv_px - below.uv_px) / (high - low)
-        seen = all_finite(self._uv) & ok[:, None] & ~(np.nan_to_num(poses.sigmas) > _OUTLIER_SIGMAS)
+        # Far from the solution every residual is long: outliers are those long beside the others.
+        sigmas = np.nan_to_num(poses.sigmas)
+        limit = _OUTLIER_SIGMAS * max(1.0, 1.5 * float(np.nanmedian(poses.sigmas)))
+        seen = all_finite(self._uv) & ok[:, None] & (sigmas <= limit)
         n, n_leds = seen.shape
         L = np.linalg.inv(np.linalg.cholesky(np.where(seen[..., None, None], self._cov, np.eye(2))))
         mask = seen[..., None]

@@ -172,6 +172,39 @@ class _Run:
         self.result.R_camera_brick[at] = poses.R_camera_brick[better]
         self.result.t_camera_brick_mm[at] = poses.t_camera_brick_mm[better]
         self.result.is_ambiguous[at] = False
+        self._complete(at)
+
+    def _complete(self, frames: IntArray) -> None:
+        """Give LEDs that the pattern missed the free blob where the verified pose sees them."""
+        frames = frames[(self.result.blob_of_led[frames] < 0).any(axis=1)]
+        if frames.size == 0:
+            return
+        R, t = self.result.R_camera_brick[frames], self.result.t_camera_brick_mm[frames]
+        prediction, _ = predict_brick(R, t, self._rays, self._brick, collar_mm=self._collar_mm)
+        proposals: list[tuple[int, IntArray]] = []
+        for row, i in enumerate(frames):
+            blobs, assigned = self._blobs[i], self.result.blob_of_led[i].copy()
+            if blobs is None:
+                continue
+            for k in np.flatnonzero((assigned < 0) & (prediction.facing[row] > 0)):
+                distance = np.hypot(*(blobs.uv_px - prediction.uv_px[row, k]).T)
+                distance[assigned[assigned >= 0]] = np.inf
+                nearest = int(np.argmin(distance))
+                if distance[nearest] < self._gate_px:
+                    assigned[k] = nearest
+            if (assigned != self.result.blob_of_led[i]).any():
+                proposals.append((int(i), assigned))
+        if not proposals:
+            return
+        at = np.array([i for i, _ in proposals])
+        uv = np.stack([_pixels(self._blobs[i], a) for i, a in proposals])
+        start = (self.result.R_camera_brick[at], self.result.t_camera_brick_mm[at])
+        kept, poses = self._verify(uv, start)
+        for row, (i, assigned) in enumerate(proposals):
+            if kept[row].sum() > (self.result.blob_of_led[i] >= 0).sum():
+                self.result.blob_of_led[i] = np.where(kept[row], assigned, -1)
+                self.result.R_camera_brick[i] = poses.R_camera_brick[row]
+                self.result.t_camera_brick_mm[i] = poses.t_camera_brick_mm[row]
 
     def _verify(
         self, uv: FloatArray, starts: tuple[FloatArray, FloatArray]

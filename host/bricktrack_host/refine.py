@@ -164,19 +164,21 @@ def refine_poses(
         R_led, t_led = R, t
         if exp_led is not None and shift is not None:
             R_led, t_led = R[:, None] @ exp_led[which], t[:, None] + shift[which]
-        return _evaluate(
-            uv_px[which],
-            cov_px2[which],
-            seen[which],
-            R_led,
-            t_led,
-            ray_model,
-            brick_model,
-            collar_mm,
-            profile_is_exact,
-            None if exp_led is None else exp_led[which],
-            lens,
-        )
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            # A false start may put LEDs beside or behind the pupil: its cost is then infinite or NaN.
+            return _evaluate(
+                uv_px[which],
+                cov_px2[which],
+                seen[which],
+                R_led,
+                t_led,
+                ray_model,
+                brick_model,
+                collar_mm,
+                profile_is_exact,
+                None if exp_led is None else exp_led[which],
+                lens,
+            )
 
     state = evaluate(frames, R, t, None)
     _descend(evaluate, state, frames, R, t, max_steps)
@@ -260,11 +262,10 @@ def _evaluate(
     residual = np.where(seen[..., None], uv - prediction.uv_px, 0.0)
     m = prediction.model_shift_px * (0.0 if profile_is_exact else 1.0)
     m = np.where(seen[..., None], m, 0.0)
-    C = np.where(seen[..., None, None], cov + m[..., :, None] * m[..., None, :], np.eye(2))
-    det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] ** 2
-    W = np.empty_like(C)
-    W[..., 0, 0], W[..., 1, 1] = C[..., 1, 1] / det, C[..., 0, 0] / det
-    W[..., 0, 1] = W[..., 1, 0] = -C[..., 0, 1] / det
+    V = _inverse_2x2(np.where(seen[..., None, None], cov, np.eye(2)))
+    Vm = np.einsum("nlij,nlj->nli", V, m)
+    gain = 1 / (1 + np.einsum("nli,nli->nl", m, Vm))
+    W = V - gain[..., None, None] * Vm[..., :, None] * Vm[..., None, :]  # inverse of cov + m m^T
     Wr = np.einsum("nlij,nlj->nli", W, residual)
     sigmas = np.sqrt(np.maximum(np.einsum("nli,nli->nl", residual, Wr), 0.0))
     weight = np.where(seen, np.minimum(1.0, HUBER_SIGMAS / np.maximum(sigmas, 1e-12)), 0.0)
@@ -289,6 +290,12 @@ def _evaluate(
         facing=prediction.facing,
         lens=prediction.lens,
     )
+
+
+def _inverse_2x2(C: FloatArray) -> FloatArray:
+    det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] * C[..., 1, 0]
+    adjugate = np.stack([C[..., 1, 1], -C[..., 0, 1], -C[..., 1, 0], C[..., 0, 0]], axis=-1)
+    return np.asarray((adjugate / det[..., None]).reshape(C.shape))
 
 
 def _nothing(n: int, n_leds: int) -> RefinedPoses:

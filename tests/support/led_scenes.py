@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pinhole import PinholeCamera
@@ -117,3 +118,50 @@ def draw_disc(
     window = light[v0 - reach[1] : v0 + reach[1] + 1, u0 - reach[0] : u0 + reach[0] + 1]
     mean = share.mean(axis=(1, 3))
     window[...] = window * (1 - mean) + level * mean
+
+
+def draw_polygon(light: FloatArray, corners: FloatArray, *, level: float, oversampling: int = 8) -> None:
+    """Add a lit polygon to a linear picture, supersampled; parts outside the picture are cut off."""
+    rows, columns = light.shape
+    low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2, 0)
+    high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 3, [columns, rows])
+    if (high <= low).any():
+        return
+    width, height = high - low
+    fine = np.zeros((height * oversampling, width * oversampling), dtype=np.uint8)
+    # Sample k of a pixel lies at (k + 0.5) / n - 0.5; cv2 counts in 1/16 of a sample.
+    points = ((corners - low + 0.5) * oversampling - 0.5) * 16
+    cv2.fillPoly(fine, [np.rint(points).astype(np.int32)], 1, shift=4)
+    share = fine.reshape(height, oversampling, width, oversampling).mean(axis=(1, 3))
+    window = light[low[1] : high[1], low[0] : high[0]]
+    window[...] = window * (1 - share) + level * share
+
+
+def picture_of_brick(
+    R: FloatArray,
+    t: FloatArray,
+    brick: BrickModel,
+    *,
+    collar: float,
+    camera: PinholeCamera,
+    hidden: Sequence[int] = (),
+    covered_right_of: dict[int, float] | None = None,
+    lamps: Sequence[tuple[float, float]] = (),
+) -> Picture:
+    """Picture of a brick at rest: domes on a dark wall, some hidden or half covered, round lamps elsewhere."""
+    light = np.full((camera.sensor_mode.height, camera.sensor_mode.width), 0.02)
+    for lamp in lamps:
+        draw_disc(light, lamp, (30.0, 30.0), level=0.9)
+    centres, axes = leds_in_camera(R[None], t[None], brick)[0], brick.led_axes @ R.T
+    for k, (centre, axis) in enumerate(zip(centres, axes, strict=True)):
+        if k in hidden:
+            continue
+        outline = lit_outline(centre, axis, radius=3.0, collar=collar, camera=camera, n=120)
+        draw_polygon(light, outline, level=0.8)
+        cover = (covered_right_of or {}).get(k)
+        if cover is not None:
+            middle = outline.mean(axis=0)
+            edge = outline[:, 0].min() + cover * np.ptp(outline[:, 0])
+            box = np.array([[edge, middle[1] - 60], [edge + 90, middle[1] - 60]])
+            draw_polygon(light, np.vstack([box, box[::-1] + np.array([0.0, 120.0])]), level=0.02)
+    return picture_of_light(light)
