@@ -174,8 +174,8 @@ def _advice(bus: str, e: OSError) -> str:
         return "The user needs the group 'i2c': sudo usermod -aG i2c USER"
     if e.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return (
-            "Enable the bus in /boot/firmware/config.txt, as "
-            "dtoverlay=i2c-gpio,bus=3,i2c_gpio_sda=5,i2c_gpio_scl=6,i2c_gpio_delay_us=2, load the module "
+            "Enable the bus in /boot/firmware/config.txt: dtparam=i2c_arm=off and "
+            "dtoverlay=i2c-gpio,bus=3,i2c_gpio_sda=2,i2c_gpio_scl=3,i2c_gpio_delay_us=2, load the module "
             "i2c-dev, and reboot (docs/device-setup.md)"
         )
     return f"Check with 'i2cdetect -l' what {bus} is"
