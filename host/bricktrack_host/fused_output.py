@@ -153,13 +153,10 @@ def _flags(
     period = float(np.median(np.diff(run.t_cam_s))) if len(run.t_cam_s) > 1 else np.inf
     away = np.minimum(np.abs(t_cam - frames[other]), np.abs(t_cam - frames[i - 1]))
     slack = 1e-6
-    rough = signal.acc_roughness_mps2
-    # A steady vibration is no impact: what counts stands out of the run.
-    limit = max(settings.impact_mps2, 4 * float(np.median(rough)))
     marks = {
         PoseFlag.DROPOUT: away > 1.5 * period,
         PoseFlag.EXTRAPOLATED: (t_cam < frames[0] - slack) | (t_cam > frames[-1] + slack),
-        PoseFlag.IMPACT: _near_sample(signal, t_imu, rough > limit),
+        PoseFlag.IMPACT: _near_sample(signal, t_imu, signal.acc_impact_mps2 > settings.impact_mps2),
         PoseFlag.CLIPPED: _near_sample(signal, t_imu, signal.clip_sd_mps2 > 0),
         PoseFlag.IMU_GAP: signal.in_gap(t_imu),
     }

@@ -253,9 +253,9 @@ def _frame_chi2(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return how far each frame lies from what all the others say: rotation and position (3), and both (6).
 
-    The smoothed state holds the frame itself. Taken out of it again: with A = H P H', r the residual and R the
-    covariance that the filter gave the frame, the others alone leave R (R - A)^-1 r, and know the frame to
-    A + A (R - A)^-1 A.
+    The smoothed state holds the frame itself. Taken out of it again: with A = H P H', r the residual and R
+    the covariance that the filter gave the frame, the others alone leave R (R - A)^-1 r, and know the frame
+    to A + A (R - A)^-1 A.
     """
     at = nodes.node_of_frame
     r, H = residuals(problem, estimate.state, at, b)

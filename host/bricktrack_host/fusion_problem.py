@@ -30,9 +30,11 @@ class FusionSettings:
     systematic_time_s : float
         How long errors by scale and lever arm keep their sign: about a tenth of a second at 2-10 Hz.
     roughness_share : float
-        Error of the integrated signal over the roughness of the samples. A 2 ms impact seen through 40 Hz
-        and 100 Hz loses up to a third of its velocity change by where it falls between samples. A steady
-        vibration loses far less: see `adapt_noise`.
+        Error of a sample, as white noise, over the steady roughness of the samples: 1 for noise. A vibration
+        at one pitch integrates to far less: see `adapt_noise`.
+    impact_share : float
+        Error of the three samples about a pulse over its height. A pulse of a few ms seen at 100 Hz may be
+        hit at its peak or at its foot, so the velocity change is unsure by nearly all of height times 10 ms.
     adapt_noise : bool
         Whether each run chooses its share of roughness and its multiple of the systematic errors by the
         likelihood of its frames.
@@ -43,7 +45,7 @@ class FusionSettings:
     gravity_mps2, gravity_sd_mps2 : float
         Its size; the default covers the whole Earth.
     offset_prior_sd_ns : float, ns
-        A measured alignment enters no tighter than this, nor than twice its own sd.
+        A measured alignment enters no tighter than this, nor than its own sd.
     acc_lag_ns, acc_lag_sd_ns : float, ns
         Accelerometer minus gyro low-pass lag, and how well it is known; BNO055 default bandwidths: -3.4 ms.
     optical_common_share : float
@@ -53,7 +55,7 @@ class FusionSettings:
         A frame whose residual to all the others, squared over its covariance, exceeds this is left out
         (6 degrees of freedom; 33 is passed by all but one in 100 000).
     impact_mps2 : float
-        Roughness above which a sample counts as an impact for the flags.
+        Height above which a pulse is flagged as an impact.
     max_position_sd_mm, max_rotation_sd_rad : float
         A pose less sure than this is given as NaN.
     """
@@ -64,7 +66,8 @@ class FusionSettings:
     acc_scale_sd: float = 0.004
     lever_arm_sd_mm: float = 1.0
     systematic_time_s: float = 0.1
-    roughness_share: float = 0.5
+    roughness_share: float = 1.0
+    impact_share: float = 0.5
     adapt_noise: bool = True
     gyro_bias_walk_radps: float = 3e-4
     acc_bias_walk_mps2: float = 0.01
@@ -72,7 +75,7 @@ class FusionSettings:
     acc_bias_sd_mps2: float = 0.5
     gravity_mps2: float = 9.80665
     gravity_sd_mps2: float = 0.03
-    offset_prior_sd_ns: float = 0.3e6
+    offset_prior_sd_ns: float = 0.15e6
     acc_lag_ns: float = 0.0
     acc_lag_sd_ns: float = 4e6
     optical_common_share: float = 0.3
@@ -226,10 +229,10 @@ class NoiseParts:
     Attributes
     ----------
     gyro_fixed, acc_fixed
-        White noise of the samples, clipping, and gaps, where the signal is only bridged and its whole spread
-        is the error.
+        White noise of the samples, impacts, clipping, and gaps, where the signal is only bridged and its
+        whole spread is the error.
     gyro_rough, acc_rough
-        Motion faster than the samples follow, at a share of 1.
+        Steady roughness beyond the sensor's own noise, at a share of 1.
     gyro_systematic, acc_systematic
         Scale and lever-arm errors in proportion to the motion, which keep their sign for a while.
     """
@@ -280,16 +283,18 @@ def noise_parts(
         return np.interp(t_s + shift_s, signal.t_s, values)
 
     gap = np.where(signal.in_gap(t_s), hold, 0.0)
+    gyro_fixed = s.gyro_noise_radps**2 + (s.impact_share * signal.gyro_impact_radps) ** 2
+    acc_fixed = s.acc_noise_mps2**2 + (s.impact_share * signal.acc_impact_mps2) ** 2 + signal.clip_sd_mps2**2
+    gyro_rough = np.maximum(signal.gyro_roughness_radps**2 - s.gyro_noise_radps**2, 0.0)
+    acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
+    acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2
     return NoiseParts(
-        gyro_fixed=s.gyro_noise_radps**2 * period + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2,
-        gyro_rough=at(signal.gyro_roughness_radps**2 * period, 0.0),
+        gyro_fixed=at(gyro_fixed * period, 0.0) + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2,
+        gyro_rough=at(gyro_rough * period, 0.0),
         gyro_systematic=at((s.gyro_scale_sd * size) ** 2 * hold, 0.0),
-        acc_fixed=at((s.acc_noise_mps2**2 + signal.clip_sd_mps2**2) * period, lin.lag_s)
-        + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2,
-        acc_rough=at(signal.acc_roughness_mps2**2 * period, lin.lag_s),
-        acc_systematic=at(
-            ((s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2) * hold, lin.lag_s
-        ),
+        acc_fixed=at(acc_fixed * period, lin.lag_s) + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2,
+        acc_rough=at(acc_rough * period, lin.lag_s),
+        acc_systematic=at(acc_systematic * hold, lin.lag_s),
     )
 
 
@@ -300,7 +305,7 @@ def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> 
     sd[ATT], sd[POS], sd[VEL] = 0.2, 1.0, 1.0
     sd[BG], sd[BA], sd[GRAV] = s.gyro_bias_sd_radps, s.acc_bias_sd_mps2, 0.5
     if a.source == "data":
-        sd[TAU] = max(s.offset_prior_sd_ns, 2 * a.offset_sd_ns) * 1e-9
+        sd[TAU] = max(s.offset_prior_sd_ns, a.offset_sd_ns) * 1e-9
         sd[SKEW] = 2 * a.skew_sd
     else:
         sd[TAU], sd[SKEW] = a.offset_sd_ns * 1e-9, a.skew_sd

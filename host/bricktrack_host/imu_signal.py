@@ -1,7 +1,7 @@
 """Inertial samples as continuous signals: splines, how far to trust them, and motion between instants.
 
 Times inside are seconds after `ImuSignal.epoch_ns` on the clock of the samples. "Roughness" is what a sample
-differs from the cubic through its neighbours: noise, or motion faster than the sample rate can follow.
+differs from the cubic through its neighbours: noise, or motion faster than the samples can follow.
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PPoly
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ShapeError
@@ -22,6 +22,8 @@ _GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
 _BRIDGE_PERIODS = 3.5  # up to here the cubic may bridge it; beyond, a straight line
 _SUBSTEPS = 4  # of at most 2.5 ms at 100 Hz: cubic signal, exact integrals, coning left below 1e-8 rad
 _PREDICTION_GAIN = 1.394  # sd of (sample - cubic through four neighbours) over sd of one sample, white noise
+_STEADY_SAMPLES = 25
+_IMPACT_SIGMA = 5.0
 _CLIP_SHARE = 0.98  # of the range: filters inside the chip round a clipped peak off a little
 
 
@@ -59,26 +61,33 @@ def _usable(imu: ImuTrack) -> BoolArray:
     return np.asarray(whole & ((imu.flags & int(bad)) == 0))
 
 
-def roughness(values: FloatArray, *, window: int = 5) -> FloatArray:
-    """Return how far samples lie from the cubic through their four neighbours, as an sd of one sample.
+def roughness(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return what of a signal is faster than its samples: the steady part, and single impacts.
+
+    Both from how far each sample lies from the cubic through its four neighbours.
 
     Parameters
     ----------
     values : ndarray, shape (n, 3), n >= 5
-    window : int
-        The greatest over this many samples and over the axes is taken.
 
     Returns
     -------
-    sd : ndarray, shape (n,), unit of ``values``
-        White noise of sd s gives about 2 s (the greatest of 15); a smooth signal nearly 0.
+    steady : ndarray, shape (n,), unit of ``values``
+        As the sd of one sample of white noise: from the median over a quarter second at 100 Hz, so that an
+        impact does not count; the greatest of the axes. A smooth signal gives nearly 0.
+    impact : ndarray, shape (n,), unit of ``values``
+        Height of a pulse that stands out of the steady part, at its sample and the two beside it; else 0.
     """
     v = as_float_array("values", values, (None, 3))
     padded = np.concatenate([v[:1].repeat(2, 0), v, v[-1:].repeat(2, 0)])
-    predicted = (4 * (padded[1:-3] + padded[3:-1]) - padded[:-4] - padded[4:]) / 6
-    sd = np.abs(v - predicted).max(axis=1) / _PREDICTION_GAIN
-    sd[[0, 1, -2, -1]] = sd[[2, 2, -3, -3]]  # the padding is no neighbour
-    return np.asarray(maximum_filter1d(sd, window, mode="nearest"))
+    off = np.abs(v - (4 * (padded[1:-3] + padded[3:-1]) - padded[:-4] - padded[4:]) / 6)
+    off[[0, 1, -2, -1]] = off[[2, 2, -3, -3]]  # the padding is no neighbour
+    window = (min(_STEADY_SAMPLES, len(v)), 1)
+    steady = median_filter(off, window, mode="nearest") / (0.6745 * _PREDICTION_GAIN)
+    # A pulse pulls its neighbours' cubics as well: only the peak counts.
+    peak = off >= 0.7 * maximum_filter1d(off, 5, axis=0, mode="nearest")
+    impact = np.where(peak & (off > _IMPACT_SIGMA * _PREDICTION_GAIN * steady), off, 0.0).max(axis=1)
+    return np.asarray(steady.max(axis=1)), np.asarray(maximum_filter1d(impact, 3, mode="nearest"))
 
 
 def _bridge_clipped(t_s: FloatArray, acc: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
@@ -113,7 +122,9 @@ class ImuSignal:
     gyro_radps, acc_mps2 : ndarray, shape (n, 3)
         Those samples; clipped accelerations completed by the cubic of their neighbours.
     gyro_roughness_radps, acc_roughness_mps2 : ndarray, shape (n,)
-        See `roughness`.
+        The steady part, see `roughness`.
+    gyro_impact_radps, acc_impact_mps2 : ndarray, shape (n,)
+        The pulses, see there.
     clip_sd_mps2 : ndarray, shape (n,)
         Above zero where a sample was clipped or stands beside one.
     gaps_s : ndarray, shape (n_gaps, 2)
@@ -127,6 +138,8 @@ class ImuSignal:
     acc_mps2: FloatArray
     gyro_roughness_radps: FloatArray
     acc_roughness_mps2: FloatArray
+    gyro_impact_radps: FloatArray
+    acc_impact_mps2: FloatArray
     clip_sd_mps2: FloatArray
     gaps_s: FloatArray
     _gyro: CubicSpline[Any]
@@ -176,6 +189,7 @@ class ImuSignal:
             knots = np.insert(knots, i + 1, t_s[i] + share[:, 0] * interval[i])
             knot_gyro = np.insert(knot_gyro, i + 1, gyro[i] + share * (gyro[i + 1] - gyro[i]), axis=0)
             knot_acc = np.insert(knot_acc, i + 1, acc[i] + share * (acc[i + 1] - acc[i]), axis=0)
+        (gyro_steady, gyro_impact), (acc_steady, acc_impact) = roughness(gyro), roughness(acc)
         gyro_spline, acc_spline = CubicSpline(knots, knot_gyro), CubicSpline(knots, knot_acc)
         return cls(
             epoch_ns=epoch_ns,
@@ -183,8 +197,10 @@ class ImuSignal:
             t_s=t_s,
             gyro_radps=gyro,
             acc_mps2=acc,
-            gyro_roughness_radps=roughness(gyro),
-            acc_roughness_mps2=roughness(acc),
+            gyro_roughness_radps=gyro_steady,
+            acc_roughness_mps2=acc_steady,
+            gyro_impact_radps=gyro_impact,
+            acc_impact_mps2=acc_impact,
             clip_sd_mps2=clip_sd,
             gaps_s=np.stack([t_s[missing], t_s[missing + 1]], axis=1),
             _gyro=gyro_spline,

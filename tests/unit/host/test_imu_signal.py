@@ -87,11 +87,17 @@ def test_chained_rotations_are_the_running_product():
 def test_roughness_tells_noise_and_impacts_from_smooth_motion():
     t = np.arange(0, 4, 0.01)
     slow = np.sin(2 * np.pi * 5 * t)[:, None] * np.ones(3)
-    assert roughness(slow)[10:-10].max() < 0.01
-    noise = np.random.default_rng(2).normal(0, 1, (400, 3))
-    assert 1.7 < np.median(roughness(noise)) < 2.4  # median of the greatest of 15 normal values: 2.0
-    slow[200] += 5.0  # 4/6 of it shows in the next sample, 1/6 in the one after; window of five
-    assert np.flatnonzero(roughness(slow) > 1).tolist() == list(range(197, 204))
+    steady, impact = roughness(slow)
+    assert steady.max() < 0.01 and (impact == 0).all()
+    noise = np.random.default_rng(2).normal(0, 0.1, (400, 3))
+    steady, impact = roughness(slow + noise)
+    assert 0.08 < np.median(steady) < 0.16  # sd 0.1; the greatest of three medians of 25
+    assert (impact > 0).mean() < 0.02
+    slow[200] += 5.0
+    steady, impact = roughness(slow + noise)
+    assert steady.max() < 0.25
+    assert np.flatnonzero(impact > 3).tolist() == [199, 200, 201]
+    assert impact[200] == pytest.approx(5.0, abs=0.5)
 
 
 def test_clipped_peak_is_completed_and_marked():
