@@ -17,6 +17,7 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel, load_brick_model
+from bricktrack_common.camera_model import RayModel
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import ConfigError, ShapeError, TrackingError, VideoError
 from bricktrack_common.frame_times import FrameTimes
@@ -27,7 +28,7 @@ from bricktrack_host.calibration_file import Calibration, CentralRaysRecord, loa
 from bricktrack_host.daq_clock import EdgeFit, EdgeFitError, fit_edges
 from bricktrack_host.fusion import FusionResult, fuse
 from bricktrack_host.optical_smoothing import smooth_optical
-from bricktrack_host.optical_track import observe_leds, solve_poses
+from bricktrack_host.optical_track import led_motion, observe_leds, solve_poses
 from bricktrack_host.plots import CalibrationPicture, FrameOverlay
 from bricktrack_host.report import ReportExtras, write_report
 from bricktrack_host.rest_pose import RestPose, tare
@@ -45,6 +46,7 @@ logger = logging.getLogger(__name__)
 RESULTS_FOLDER = "results"
 REPORT_NAME = "report.html"
 _N_OVERLAYS = 4
+_RETIME_PASSES = 2
 
 
 class ProcessSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -187,6 +189,8 @@ def process_run(
         alignment = None if imu is None else _align(optical, imu, run, settings, problems)
         rest = _rest_pose(optical, imu, alignment, problems)
     with stages("fuse"):
+        if settings.rolling_shutter:
+            optical = _retime(observations, optical, imu, alignment, rays.ray_model, brick)
         grid = _output_grid(optical, imu, alignment, edge_fit)
         fused, fusion = _fuse(optical, imu, alignment, brick, grid, problems)
     result = RunResult(
@@ -375,6 +379,35 @@ def _output_grid(
         index = index[inside]
         t_ns["edge"] = edges[inside]
     return _Grid(t_ns, index)
+
+
+def _retime(
+    observations: LedObservations,
+    optical: OpticalTrack,
+    imu: ImuTrack | None,
+    alignment: TimeAlignment | None,
+    rays: RayModel,
+    brick: BrickModel,
+) -> OpticalTrack:
+    """Solve the poses again with each LED carried to its frame's instant by the fused motion.
+
+    Splines through 30 frames a second cannot follow a motion above 15 Hz, and read-out takes 20 ms: the IMU
+    knows what the brick did meanwhile.
+    """
+    if imu is None or alignment is None or brick.imu_lever_arm_mm is None:
+        return optical
+    n = len(optical.t_ns)
+    for _ in range(_RETIME_PASSES):
+        wanted = np.concatenate([optical.t_ns, optical.led_t_ns.ravel()])
+        try:
+            track = fuse(
+                optical, imu, lever_arm_mm=brick.imu_lever_arm_mm, output_t_ns=wanted, alignment=alignment
+            ).track
+        except (ShapeError, TrackingError):
+            return optical  # the fusion itself will say why
+        motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)))
+        optical = solve_poses(observations, rays, brick, motion=motion)
+    return optical
 
 
 def _fuse(
