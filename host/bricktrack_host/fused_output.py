@@ -4,7 +4,8 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
-from bricktrack_host.fusion_problem import FusionSettings, Linearisation, Nodes, Run
+from bricktrack_host.fusion_problem import Linearisation, Nodes, Run
+from bricktrack_host.fusion_settings import FusionSettings
 from bricktrack_host.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.smoother import (

@@ -17,7 +17,6 @@ from bricktrack_common.errors import ConfigError, ShapeError
 from bricktrack_common.rotations import nearest_rotation
 from bricktrack_host.fused_output import sample_motion
 from bricktrack_host.fusion_problem import (
-    FusionSettings,
     Linearisation,
     Nodes,
     NoiseLevel,
@@ -27,6 +26,7 @@ from bricktrack_host.fusion_problem import (
     first_linearisation,
     place_nodes,
 )
+from bricktrack_host.fusion_settings import FusionSettings
 from bricktrack_host.imu_signal import chain_rotations
 from bricktrack_host.smoother import (
     BA,

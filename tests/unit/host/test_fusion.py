@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import ConfigError, ShapeError, TrackingError
 from bricktrack_host.fusion import FusionInput, fuse, fuse_batch
-from bricktrack_host.fusion_problem import FusionSettings
+from bricktrack_host.fusion_settings import FusionSettings
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.time_alignment import align_times
 
