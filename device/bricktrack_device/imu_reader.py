@@ -77,6 +77,7 @@ class ImuReader:
         )
         self._ready: SamplerReady | None = None
         self._problem = ""
+        self._reset_words = ""
         self._started_ns = 0
         self._seen_count = 0
         self._seen_at_ns = 0
@@ -91,6 +92,11 @@ class ImuReader:
     def problem(self) -> str:
         """Why there are no more samples, or ``""``."""
         return self._problem
+
+    @property
+    def reset_words(self) -> str:
+        """That the sensor was seen in another mode than it was set to, or ``""``; its samples go on."""
+        return self._reset_words
 
     @property
     def is_ready(self) -> bool:
@@ -131,6 +137,7 @@ class ImuReader:
             count = self._buffer.count
             if count != self._seen_count:
                 self._seen_count, self._seen_at_ns = count, now
+                self._look_for_reset(self._ready.facts.opr_mode)
             elif now - self._seen_at_ns > max(_HANG_NS, _HANG_PERIODS * self._period_ns):
                 silent_s = (now - self._seen_at_ns) / 1e9
                 self._problem = f"its sampler hangs: no slot for {silent_s:.1f} s; the bus may be stuck"
@@ -194,7 +201,7 @@ class ImuReader:
             samples=count - n_failed,
             gaps=max(0, slots - count) + n_failed,
             calibration=calibration,
-            problem=self._problem,
+            problem=self._problem or self._reset_words,
         )
 
     def stop(self) -> None:
@@ -206,6 +213,18 @@ class ImuReader:
             self._buffer.close()
             self._buffer = None
         self._connection.close()
+
+    def _look_for_reset(self, opr_mode: int) -> None:
+        """Compare the mode that the sensor says it is in; a reset in mid-run raises no error on the bus."""
+        if self._reset_words or self._buffer is None:
+            return
+        recent = self._buffer.records(newest=self.settings.status_every + 1)
+        modes = [r.status[2] for r in recent if r.status is not None]
+        if modes and modes[-1] != opr_mode:
+            self._reset_words = (
+                f"operation mode reads 0x{modes[-1]:02X} where 0x{opr_mode:02X} was set: the sensor was "
+                "reset and delivers nothing usable until the unit is armed again. Check its supply"
+            )
 
     def _take_messages(self) -> None:
         try:

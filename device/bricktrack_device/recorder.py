@@ -351,8 +351,11 @@ class Recorder:
         self._unsaved = None
         self._try_again_at = 0.0
         self._change("saved", run_id=unsaved.recording.run_id)
-        for words in unsaved.recording.missing:
-            logger.warning("%s: %s", unsaved.recording.run_id, words)
+        if unsaved.recording.missing:
+            logger.warning(
+                "%s: %d things are missing or wrong, as its manifest says; the last: %s",
+                unsaved.recording.run_id, len(unsaved.recording.missing), unsaved.recording.missing[-1],
+            )  # fmt: skip
         return True
 
     def _end(self) -> None:

@@ -73,6 +73,7 @@ class Session:
         self._camera_problem = ""
         self.imus: list[ImuReader] = []
         self._imu_problems_told: set[str] = set()
+        self._imu_resets_told: set[str] = set()
         self.trigger: Trigger | None = None
         self._t_armed_ns = 0
         self._arm_triplet: ClockTriplet | None = None
@@ -186,6 +187,9 @@ class Session:
             if reader.problem and reader.name not in self._imu_problems_told:
                 self._imu_problems_told.add(reader.name)
                 self._note_missing(f"imu {reader.name}: {reader.problem}{self._when()}")
+            if reader.reset_words and reader.name not in self._imu_resets_told:
+                self._imu_resets_told.add(reader.name)
+                self._note_missing(f"imu {reader.name}: {reader.reset_words}{self._when()}")
         if self._camera_section is None or self._camera_problem:
             return
         period_ns = self._camera_section.frame_duration_us * 1000

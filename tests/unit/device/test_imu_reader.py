@@ -66,6 +66,17 @@ def test_a_hanging_sampler_is_noticed_and_ended() -> None:
         reader.stop()
 
 
+def test_a_sensor_that_resets_itself_in_silence_is_told_and_goes_on() -> None:
+    reader = reader_on(FakeBusOpener(reset_after=30))
+    reader.start()
+    try:
+        poll_until(reader, lambda: bool(reader.reset_words))
+        assert "reads 0x00 where 0x07 was set" in reader.status().problem
+        assert reader.is_ready and not reader.problem
+    finally:
+        reader.stop()
+
+
 def test_a_sensor_that_is_not_there_is_said_in_the_drivers_words() -> None:
     reader = reader_on(FakeBusOpener(present=False))
     reader.start()

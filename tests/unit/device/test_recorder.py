@@ -209,8 +209,8 @@ def test_stopping_in_the_middle_saves_an_interrupted_run(bench: Callable[..., Be
     assert run.frames is not None and run.frames.n_frames >= 10
 
 
-def test_too_little_space_refuses_arming_with_numbers(bench: Callable[..., Bench]) -> None:
-    b = bench(storage=StorageTable(folder="/dev/shm", margin_mb=10**9))
+def test_too_little_space_refuses_arming_with_numbers(bench: Callable[..., Bench], tmp_path: Path) -> None:
+    b = bench(storage=StorageTable(folder=str(tmp_path), margin_mb=10**9))
     reply = b.ask("arm", "", None)
     assert isinstance(reply, Refusal) and reply.code == "no-space" and "MB" in reply.message
 

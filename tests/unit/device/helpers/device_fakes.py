@@ -28,6 +28,7 @@ class FakeBus:
     hang_after: int | None = None
     exit_after: int | None = None
     fail_every: int | None = None
+    reset_after: int | None = None
     stuck_registers: dict[int, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -95,6 +96,8 @@ class FakeBus:
                 os._exit(7)
             if self.fail_every is not None and self.n_bursts % self.fail_every == 0:
                 raise OSError(errno.EREMOTEIO, "injected")
+            if self.n_bursts == self.reset_after:
+                self._reset()
             self.pages[0][0x08:0x0A] = (self.n_bursts % 1000).to_bytes(2, "little")
         return bytes(self.pages[self.page][register : register + n_bytes])
 
@@ -114,13 +117,14 @@ class FakeBusOpener:
     hang_after: int | None = None
     exit_after: int | None = None
     fail_every: int | None = None
+    reset_after: int | None = None
 
     def __call__(self) -> I2cBus:
         # Called in the sampler's process: there the driver need not wait 0.7 s for a table of registers.
         adafruit_bno055.time = SimpleNamespace(sleep=lambda seconds: None)
         return FakeBus(
             present=self.present, hang_after=self.hang_after, exit_after=self.exit_after,
-            fail_every=self.fail_every,
+            fail_every=self.fail_every, reset_after=self.reset_after,
         )  # fmt: skip
 
 
