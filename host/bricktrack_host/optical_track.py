@@ -2,7 +2,9 @@
 
 Each LED is seen at the mid-exposure of its own row; a pose is stated at that of the picture's centre row. The
 first pass takes the frame as one instant; splines through its poses then say how far the brick moves between
-the two instants, and the poses are fitted again, each LED at its own time, until that settles.
+the two instants, and the poses are fitted again, each LED at its own time, until that settles. What the
+splines cannot follow, an impact or the shake's upper frequencies, is corrected by the frame itself: its rows
+are 20 ms of motion, and pose and twist are fitted together, with the splines' twist as a prior.
 """
 
 import numpy as np
@@ -155,7 +157,7 @@ def led_motion(at_frames: FusedTrack, at_leds: FusedTrack) -> LedMotion:
     return LedMotion(
         rvec_brick_rad=turn,
         shift_camera_mm=t_mm - at_frames.t_camera_brick_mm[:, None],
-        dt_s=(at_leds.t_ns.reshape(n, -1) - at_frames.t_ns[:, None]) * 1e-9,
+        dt_s=np.asarray((at_leds.t_ns.reshape(n, -1) - at_frames.t_ns[:, None]) * 1e-9, dtype=np.float64),
         twist_sd=np.tile(_FUSED_TWIST_SD, (n, 1)),
     )
 
@@ -333,7 +335,11 @@ def _twist_sd(samples: FloatArray, period_s: float) -> FloatArray:
 
 
 def _misfit(poses: RefinedPoses, uv: FloatArray) -> FloatArray:
-    """Return by how much the residuals of the run, or of a frame, exceed what the covariances allow; >= 1."""
+    """Return the factor on each frame's covariance that the residuals of the run, and its own, ask for; >= 1.
+
+    Never below one: what all LEDs have in common does not show in residuals, and the freedom that the profile
+    and the twist leave the LEDs takes some of the chi-square.
+    """
     dof = _dof(uv)
     with np.errstate(invalid="ignore", divide="ignore"):
         reduced = np.where(dof >= 2, poses.chi2 / dof, np.nan)

@@ -5,7 +5,6 @@ covariance, and taken at the LED's own instant: the caller gives how far the bri
 frame's instant and the LED's.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -16,7 +15,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.finite import all_finite
-from bricktrack_host.led_profile import LensTerms, predict_brick
+from bricktrack_host.led_profile import LedPrediction, LensTerms, predict_brick
 
 HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
@@ -37,10 +36,17 @@ class LedMotion:
         ``R_led = R @ Exp(rvec)``.
     shift_camera_mm : ndarray, shape (n, n_leds, 3), mm
         ``t_led = t + shift``.
+    dt_s : ndarray, shape (n, n_leds), s
+        From the frame's instant to the LED's.
+    twist_sd : ndarray, shape (n, 6), rad/s and mm/s, or None
+        How well that motion is known, as a twist: the frame's own rows then correct it, as far as they can.
+        `None`: it is taken as given.
     """
 
     rvec_brick_rad: FloatArray
     shift_camera_mm: FloatArray
+    dt_s: FloatArray
+    twist_sd: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,42 +162,24 @@ def refine_poses(
     frames = np.flatnonzero((seen.sum(axis=1) >= MIN_LEDS) & started)
     if frames.size == 0:
         return out
-    R, t = R_start[frames].copy(), t_start_mm[frames].copy()
-    exp_led = None if motion is None else matrix_from_rvec(motion.rvec_brick_rad)
-    shift = None if motion is None else motion.shift_camera_mm
-
-    def evaluate(which: IntArray, R: FloatArray, t: FloatArray, lens: LensTerms | None) -> _Evaluation:
-        R_led, t_led = R, t
-        if exp_led is not None and shift is not None:
-            R_led, t_led = R[:, None] @ exp_led[which], t[:, None] + shift[which]
-        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-            # A false start may put LEDs beside or behind the pupil: its cost is then infinite or NaN.
-            return _evaluate(
-                uv_px[which],
-                cov_px2[which],
-                seen[which],
-                R_led,
-                t_led,
-                ray_model,
-                brick_model,
-                collar_mm,
-                profile_is_exact,
-                None if exp_led is None else exp_led[which],
-                lens,
-            )
-
-    state = evaluate(frames, R, t, None)
-    _descend(evaluate, state, frames, R, t, max_steps)
-    moved = np.linalg.norm(t - t_start_mm[frames], axis=1) > _LENS_MM
-    moved |= np.linalg.norm(R - R_start[frames], axis=(1, 2)) > _LENS_RAD
-    moved &= np.isfinite(state.cost)
-    if moved.any():  # the lens terms are of the start: have them anew
-        again = np.flatnonzero(moved)
-        R_again, t_again = R[again], t[again]
-        fresh = evaluate(frames[again], R_again, t_again, None)
-        _descend(evaluate, fresh, frames[again], R_again, t_again, 3)
-        R[again], t[again] = R_again, t_again
-        state.put(again, fresh, slice(None))
+    state_R, state_t = R_start[frames].copy(), t_start_mm[frames].copy()
+    start = _State(state_R, state_t, np.zeros((frames.size, 6)))
+    problem = _Problem(uv_px, cov_px2, seen, ray_model, brick_model, collar_mm, profile_is_exact, motion)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        # A false start may put LEDs beside or behind the pupil: its cost is then infinite or NaN.
+        state = problem.evaluate(frames, start, None)
+        _descend(problem, state, frames, start, max_steps)
+        moved = np.linalg.norm(start.t - t_start_mm[frames], axis=1) > _LENS_MM
+        moved |= np.linalg.norm(start.R - R_start[frames], axis=(1, 2)) > _LENS_RAD
+        moved &= np.isfinite(state.cost)
+        if moved.any():  # the lens terms are of the start: have them anew
+            again = np.flatnonzero(moved)
+            there = start.take(again)
+            fresh = problem.evaluate(frames[again], there, None)
+            _descend(problem, fresh, frames[again], there, 3)
+            start.put(again, there, slice(None))
+            state.put(again, fresh, slice(None))
+    R, t = start.R, start.t
     good = np.isfinite(state.cost)
     condition = np.linalg.cond(state.A[good]) if good.any() else np.zeros(0)
     good[np.flatnonzero(good)[condition > 1e14]] = False
@@ -199,7 +187,7 @@ def refine_poses(
     out.R_camera_brick[rows], out.t_camera_brick_mm[rows] = R[good], t[good]
     inverse = np.linalg.inv(state.A[good])
     shared = np.einsum("nij,nj->ni", inverse, state.shift[good])
-    out.covariance[rows] = inverse + shared[:, :, None] * shared[:, None, :]
+    out.covariance[rows] = (inverse + shared[:, :, None] * shared[:, None, :])[:, :6, :6]
     out.residual_px[rows], out.sigmas[rows] = state.residual[good], state.sigmas[good]
     out.is_outlier[rows] = np.nan_to_num(state.sigmas[good]) > OUTLIER_SIGMAS
     out.chi2[rows] = state.cost[good]
@@ -208,14 +196,26 @@ def refine_poses(
     return out
 
 
-def _descend(
-    evaluate: Callable[[IntArray, FloatArray, FloatArray, LensTerms | None], _Evaluation],
-    state: _Evaluation,
-    frames: IntArray,
-    R: FloatArray,
-    t: FloatArray,
-    max_steps: int,
-) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """Poses of some frames, and what is added to the twist that their LEDs' motion was had from."""
+
+    R: FloatArray
+    t: FloatArray
+    twist: FloatArray
+
+    def take(self, which: IntArray) -> "_State":
+        return _State(self.R[which], self.t[which], self.twist[which])
+
+    def put(self, rows: IntArray, by: "_State", which: BoolArray | slice) -> None:
+        self.R[rows], self.t[rows], self.twist[rows] = by.R[which], by.t[which], by.twist[which]
+
+    def moved(self, step: FloatArray) -> "_State":
+        twist = self.twist + step[:, 6:] if step.shape[1] > 6 else self.twist
+        return _State(self.R @ matrix_from_rvec(step[:, :3]), self.t + step[:, 3:6], twist)
+
+
+def _descend(problem: "_Problem", state: _Evaluation, frames: IntArray, at: _State, max_steps: int) -> None:
     """Take damped Gauss-Newton steps, in place, until each frame's step is far below its uncertainty."""
     damping = np.full(frames.size, 1e-6)
     live = np.isfinite(state.cost)
@@ -225,14 +225,14 @@ def _descend(
             break
         A = state.A[todo]
         damped = damping[todo, None] * np.einsum("nii->ni", A) + 1e-12
-        step = np.linalg.solve(A + damped[..., None] * np.eye(6), state.g[todo][..., None])[..., 0]
+        step = np.linalg.solve(A + damped[..., None] * np.eye(A.shape[-1]), state.g[todo][..., None])[..., 0]
         size = np.linalg.norm(step[:, :3], axis=1)
         step *= np.minimum(1.0, 0.5 / np.maximum(size, 1e-12))[:, None]
-        R_new, t_new = R[todo] @ matrix_from_rvec(step[:, :3]), t[todo] + step[:, 3:]
-        new = evaluate(frames[todo], R_new, t_new, state.lens.take(todo))
+        there = at.take(todo).moved(step)
+        new = problem.evaluate(frames[todo], there, state.lens.take(todo))
         better = new.cost <= state.cost[todo] * (1 + 1e-12) + 1e-12
         took, kept = todo[better], todo[~better]
-        R[took], t[took] = R_new[better], t_new[better]
+        at.put(took, there, better)
         state.put(took, new, better)
         damping[took] = np.maximum(damping[took] / 10, 1e-9)
         damping[kept] = np.maximum(damping[kept] * 100, 1e-4)
@@ -241,24 +241,64 @@ def _descend(
         live[damping > 1e6] = False
 
 
-def _evaluate(
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """What does not change while poses are fitted."""
+
+    uv_px: FloatArray
+    cov_px2: FloatArray
+    seen: BoolArray
+    ray_model: RayModel
+    brick_model: BrickModel
+    collar_mm: float | None
+    profile_is_exact: bool
+    motion: LedMotion | None
+
+    def evaluate(self, which: IntArray, at: _State, lens: LensTerms | None) -> _Evaluation:
+        """Return cost, normal equations and residuals of the frames ``which`` at their poses ``at``."""
+        R_led, t_led, E, dt, sd = at.R, at.t, None, None, None
+        if self.motion is not None:
+            dt = self.motion.dt_s[which][..., None]
+            E = matrix_from_rvec(self.motion.rvec_brick_rad[which] + at.twist[:, None, :3] * dt)
+            R_led = at.R[:, None] @ E
+            t_led = at.t[:, None] + self.motion.shift_camera_mm[which] + at.twist[:, None, 3:] * dt
+            sd = None if self.motion.twist_sd is None else self.motion.twist_sd[which]
+        prediction, J = predict_brick(
+            R_led, t_led, self.ray_model, self.brick_model, collar_mm=self.collar_mm, lens=lens
+        )
+        if E is not None and dt is not None:
+            own = J
+            # R_led = R E: a turn dtheta of the frame's brick is E^T dtheta of the LED's.
+            J = np.concatenate([own[..., :3] @ np.swapaxes(E, -1, -2), own[..., 3:]], axis=-1)
+            if sd is not None:
+                J = np.concatenate([J, own * dt[..., None]], axis=-1)
+        behind = np.asarray((t_led[..., 2] <= 0).reshape(len(which), -1).any(axis=-1), dtype=np.bool_)
+        result = _normal_equations(
+            self.uv_px[which],
+            self.cov_px2[which],
+            self.seen[which],
+            prediction,
+            J,
+            behind,
+            self.profile_is_exact,
+        )
+        if sd is not None:
+            index = np.arange(6, 12)
+            result.A[:, index, index] += 1 / sd**2
+            result.g[:, 6:] -= at.twist / sd**2
+            result.cost[:] += np.sum((at.twist / sd) ** 2, axis=1)
+        return result
+
+
+def _normal_equations(
     uv: FloatArray,
     cov: FloatArray,
     seen: BoolArray,
-    R_led: FloatArray,
-    t_led: FloatArray,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    collar_mm: float | None,
+    prediction: LedPrediction,
+    J: FloatArray,
+    behind: BoolArray,
     profile_is_exact: bool,
-    exp_led: FloatArray | None,
-    lens: LensTerms | None,
 ) -> _Evaluation:
-    prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_mm, lens=lens)
-    if exp_led is not None:
-        # R_led = R E: a turn dtheta of the frame's brick is E^T dtheta of the LED's.
-        J = J.copy()
-        J[..., :3] = J[..., :3] @ np.swapaxes(exp_led, -1, -2)
     residual = np.where(seen[..., None], uv - prediction.uv_px, 0.0)
     m = prediction.model_shift_px * (0.0 if profile_is_exact else 1.0)
     m = np.where(seen[..., None], m, 0.0)
@@ -273,10 +313,10 @@ def _evaluate(
     J = np.where(seen[..., None, None], J, 0.0)
     WJ = (weight[..., None, None] * W) @ J
     n, n_leds = seen.shape
-    A = np.swapaxes(J.reshape(n, 2 * n_leds, 6), 1, 2) @ WJ.reshape(n, 2 * n_leds, 6)
+    k = J.shape[-1]
+    A = np.swapaxes(J.reshape(n, 2 * n_leds, k), 1, 2) @ WJ.reshape(n, 2 * n_leds, k)
     g = np.einsum("nlik,nli->nk", WJ, residual)
     shift = np.einsum("nlik,nli->nk", WJ, m)
-    behind = (t_led[..., 2] <= 0).any(axis=-1) if t_led.ndim == 3 else t_led[..., 2] <= 0
     cost = np.where(seen, huber, 0.0).sum(axis=1)
     cost = np.where(behind | ~all_finite(A, 2), np.inf, cost)
     return _Evaluation(

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from bricktrack_common.brick_model import LayoutFile, LedEntry, ProfileEntry, brick_model_from_file
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.led_profile import predict_brick
-from bricktrack_host.optical_track import led_times_ns, solve_poses
+from bricktrack_host.optical_track import led_motion, led_times_ns, solve_poses
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.tracks import LedObservations
+from bricktrack_host.tracks import FusedTrack, LedObservations
 
 CAMERA = PinholeCamera()
 BRICK = seven_leds(collar_mm=0.7)
@@ -210,3 +210,55 @@ def test_observations_of_another_layout_are_refused():
 
 def test_no_frames_give_an_empty_track():
     assert len(solve_poses(observations(np.empty((0, 7, 2))), CAMERA, BRICK).t_ns) == 0
+
+
+def track_at(t_ns):
+    """The true motion as a fused track."""
+    R, t = shake((t_ns - 7_000_000_000) * 1e-9)
+    n = len(t_ns)
+    return FusedTrack(
+        t_ns=t_ns,
+        R_camera_brick=R,
+        t_camera_brick_mm=t,
+        omega_brick_radps=np.zeros((n, 3)),
+        v_camera_mmps=np.zeros((n, 3)),
+        covariance=np.broadcast_to(np.eye(6), (n, 6, 6)),
+        flags=np.zeros(n, dtype=np.int64),
+    )
+
+
+def test_a_motion_that_is_known_otherwise_takes_the_place_of_splines():
+    uv, _, t = rolling_pixels(6)
+    seen = observations(uv)
+    t_ns, led_t_ns = led_times_ns(seen, CAMERA)
+    motion = led_motion(track_at(t_ns), track_at(led_t_ns.ravel()))
+    np.testing.assert_allclose(motion.dt_s, (led_t_ns - t_ns[:, None]) * 1e-9)
+    known = solve_poses(seen, CAMERA, BRICK, motion=motion)
+    # Six frames are few for a spline; the true motion leaves the profile's and the lens terms' micrometres.
+    np.testing.assert_allclose(known.t_camera_brick_mm, t, atol=0.01)
+
+
+def test_an_impact_that_no_spline_follows_is_corrected_by_the_frames_own_rows():
+    first = np.arange(30) * PERIOD_NS * 1e-9 - EXPOSURE_NS * 0.5e-9
+
+    def kicked(seconds):
+        R, t = shake(np.zeros_like(seconds))
+        late = np.maximum(seconds - 0.5, 0.0)[..., None] * np.array([120.0, -40.0, 60.0])  # mm/s, at once
+        return R, t + np.minimum(late, [[4.0]] if late.ndim == 2 else 4.0)
+
+    v = np.full((30, 7), 539.5)
+    for _ in range(6):
+        prediction, _ = predict_brick(
+            *kicked(first[:, None] + v * LINE_NS * 1e-9), CAMERA, BRICK, collar_mm=0.7
+        )
+        v = prediction.uv_px[..., 1]
+    _, t = kicked(first + 539.5 * LINE_NS * 1e-9)
+    track = solve_poses(observations(prediction.uv_px), CAMERA, BRICK)
+    error = np.abs(track.t_camera_brick_mm - t).max(axis=1)
+    at = int(np.argmin(np.abs(first + 0.01 - 0.5)))
+    away = np.abs(np.arange(30) - at) > 2
+    assert error[away].max() < 0.1
+    # 120 mm/s that start or end within a frame's read-out: 1.2 mm over its half.
+    assert error.max() < 0.8
+    sd_mm = np.sqrt(track.covariance[:, 5, 5])
+    assert sd_mm[at] > 3 * np.median(sd_mm)
