@@ -5,6 +5,7 @@ from typing import Literal
 
 import msgspec
 import numpy as np
+from rich import box
 from rich.table import Table
 from scipy.stats import chi2
 
@@ -264,7 +265,7 @@ def _group_masks(
         "at frames": calm if kind == "frame" else nowhere,
         "between frames": nowhere if kind == "frame" else calm,
         "during dropouts": dropout & ~outside,
-        "within 50 ms of an impact": impact & ~dropout & ~outside,
+        "near impacts": impact & ~dropout & ~outside,
         "extrapolated": outside,
     }
 
@@ -309,22 +310,24 @@ def _snap(t_ns: IntArray, frames_ns: IntArray) -> IntArray:
 
 
 def comparison_table(comparison: TruthComparison, *, from_rest: bool = False) -> Table:
-    """Return the figures as a table for the terminal.
-
-    Each cell is the root mean square and, after the stroke, the largest magnitude.
-    """
-    what = "displacement from rest, brick axes" if from_rest else "camera axes, nothing zeroed"
-    table = Table(title=f"Errors against simulated truth: rms / largest ({what})")
-    table.add_column("track")
-    table.add_column("instants")
+    """Return the figures as a table for the terminal: root mean squares, and under them largest magnitudes."""
+    what = "displacements from rest, brick axes" if from_rest else "camera axes, nothing zeroed"
+    table = Table(
+        title=f"Errors against simulated truth: {what}",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("rms; below: largest")
     table.add_column("n", justify="right")
     for name in COMPONENTS:
-        table.add_column(f"{name} {'deg' if name.startswith('rot') else 'mm'}", justify="right")
+        unit = "deg" if name.startswith("rot") else "mm"
+        table.add_column(f"{name.replace('rot ', 'r')} {unit}", justify="right")
     if not from_rest:
-        table.add_column("NEES/6", justify="right")
         table.add_column("in 95 %", justify="right")
     for g in comparison.from_rest if from_rest else comparison.groups:
-        cells = [f"{r:.3f} / {m:.3f}" if g.n else "-" for r, m in zip(g.rms, g.largest, strict=True)]
-        honest = [] if from_rest else [f"{g.nees_mean:.2f}", f"{100 * g.nees_within_95:.0f} %"]
-        table.add_row(g.source, g.group, str(g.n), *cells, *honest)
+        if g.n:
+            honest = [] if from_rest else [f"{100 * g.nees_within_95:.0f} %"]
+            table.add_row(f"{g.source}, {g.group}", str(g.n), *(f"{x:.3f}" for x in g.rms), *honest)
+            table.add_row("", "", *(f"{x:.3f}" for x in g.largest), style="dim")
     return table

@@ -107,8 +107,10 @@ def fit(
         float | None, typer.Option(help="Diameter of the dots, mm; measured where not given.")
     ] = None,
     model: Annotated[
-        Literal["auto", "central", "two-plane"],
-        typer.Option(help="Rays through one point, the paper's two planes, or whichever the data support."),
+        Literal["auto", "central", "walking-pupil", "two-plane"],
+        typer.Option(
+            help="Rays through one point, nearly so, the paper's two planes, or what the data support."
+        ),
     ] = "auto",
     order: Annotated[
         int | None, typer.Option(min=1, max=15, help="Order of the polynomials; cross-validated by default.")
@@ -331,7 +333,7 @@ def _report(fitted: RayCalibration, *, names: list[str], simulated: bool) -> Non
     console.print(candidates)
     console.print(f"Model: {choice.reason}")
     share = float(np.mean(covered))
-    both = "" if choice.model == "central" else " at both planes"
+    both = " at both planes" if choice.model == "two-plane" else ""
     console.print(f"Dots surround {share:.0%} of the picture{both}.")
     if share < WARN_BELOW_COVERED:
         console.print(

@@ -220,7 +220,7 @@ def _record(client: UnitClient, process: "subprocess.Popen[bytes]", duration_s: 
             if status.state == "fault":
                 raise DeviceError(f"the daemon reports a fault: {status.reason}")
             if status.state == "idle":
-                out.print(f"saved; {status.edges} edges of the square wave, {status.frames} frames seen")
+                out.print("saved on the unit's card", markup=False)
                 return armed.run_id
             if status.state == "recording" and start is None:
                 start = time.monotonic()

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bricktrack_host.cli import calibrate, fleet, import_cmd
+from bricktrack_host.cli import calibrate, demo, fleet, import_cmd, process
 from bricktrack_host.cli._console import out, set_up_logging
 from bricktrack_host.cli._errors import BricktrackGroup
 from bricktrack_host.cli.pull import make_pull_command
@@ -44,9 +44,12 @@ def _options(
 app.command("status")(fleet.status)
 app.command("arm")(fleet.arm)
 app.command("disarm")(fleet.disarm)
-app.command("pull")(make_pull_command())
+app.command("pull")(make_pull_command(process.process_pulled))
 app.command("import")(import_cmd.import_recording)
 app.add_typer(calibrate.app, name="calibrate")
+app.command("process")(process.process)
+app.command("report")(process.report)
+app.command("demo")(demo.demo)
 
 
 def main() -> None:

@@ -25,6 +25,7 @@ from bricktrack_host.pipeline import (
 )
 from bricktrack_host.pull import PulledRun
 from bricktrack_host.report import ReportExtras, write_report
+from bricktrack_host.report_pictures import PICTURES_NAME, load_pictures
 from bricktrack_host.results import read_result
 from bricktrack_host.run_summary import key_figures, verdict
 from bricktrack_host.true_motion import read_true_motion
@@ -180,7 +181,8 @@ def report(
     path = find_truth(run, truth)
     comparison = None if path is None else compare_with_truth(result, read_true_motion(path))
     page = output or folder / REPORT_NAME
-    write_report(result, page, ReportExtras(truth=comparison))
+    overlays, covered = load_pictures(folder / PICTURES_NAME)
+    write_report(result, page, ReportExtras(overlays=overlays, calibration=covered, truth=comparison))
     line, problems = verdict(result, key_figures(result))
     out.print(f"{result.manifest.run_id}: {line}", markup=False, soft_wrap=True)
     for problem in problems:
