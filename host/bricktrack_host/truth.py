@@ -310,7 +310,7 @@ def _snap(t_ns: IntArray, frames_ns: IntArray) -> IntArray:
 
 
 def comparison_table(comparison: TruthComparison, *, from_rest: bool = False) -> Table:
-    """Return the figures as a table for the terminal: root mean squares, and under them largest magnitudes."""
+    """Return the figures as a table for the terminal: root mean squares, below them largest magnitudes."""
     what = "displacements from rest, brick axes" if from_rest else "camera axes, nothing zeroed"
     table = Table(
         title=f"Errors against simulated truth: {what}",
@@ -318,13 +318,13 @@ def comparison_table(comparison: TruthComparison, *, from_rest: bool = False) ->
         box=box.SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
-    table.add_column("rms; below: largest")
+    table.add_column("rms; below: largest", no_wrap=True)
     table.add_column("n", justify="right")
     for name in COMPONENTS:
         unit = "deg" if name.startswith("rot") else "mm"
         table.add_column(f"{name.replace('rot ', 'r')} {unit}", justify="right")
     if not from_rest:
-        table.add_column("in 95 %", justify="right")
+        table.add_column("95 %", justify="right")
     for g in comparison.from_rest if from_rest else comparison.groups:
         if g.n:
             honest = [] if from_rest else [f"{100 * g.nees_within_95:.0f} %"]

@@ -58,7 +58,7 @@ def test_a_constant_error_is_told_exactly_and_vanishes_from_rest(result, truth):
 
 def test_groups_hold_each_instant_once(result, truth):
     comparison = compare_with_truth(result, truth)
-    parts = ("at frames", "between frames", "during dropouts", "within 50 ms of an impact")
+    parts = ("at frames", "between frames", "during dropouts", "near impacts")
     total = sum(g.n + g.n_without for g in comparison.groups if g.source == "fused" and g.group in parts)
     everything = group(comparison, "fused", "all")
     assert total == everything.n + everything.n_without
