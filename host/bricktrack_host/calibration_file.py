@@ -231,7 +231,11 @@ def make_calibration(
             covered_a_px=_corners(model.region_a),
             covered_b_px=_corners(model.region_b),
         )
-        how = f"two-plane incident-ray tracking, order {model.order}"
+        how = (
+            f"walking pupil, slopes of order {fitted.choice.order}, stored as two planes"
+            if fitted.choice.model == "walking-pupil"
+            else f"two-plane incident-ray tracking, order {model.order}"
+        )
     return Calibration(
         unit=unit,
         sensor_mode=model.sensor_mode,

@@ -3,7 +3,7 @@
 Gross outliers are taken out and the centroids corrected for the discs' bias. The order is found by leaving
 out blocks of dots and predicting them (a random choice of dots would be surrounded by others and say nothing
 of the rim), together with what the dots' scatter makes of the places without dots. Central rays are tested
-against the two-plane model that has them as a special case.
+against the models that have them as a special case.
 """
 
 from collections.abc import Sequence
@@ -17,16 +17,17 @@ from scipy.stats import f as f_distribution
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host import central_rays, irt
+from bricktrack_host import central_rays, irt, walking_pupil
 from bricktrack_host.central_rays import CentralRays, fit_central_rays
 from bricktrack_host.disc_bias import disc_bias_px, disc_diameter_mm
 from bricktrack_host.dot_observations import DotObservations
 from bricktrack_host.irt import PAPER_ORDER, TwoPlaneIrt, fit_two_plane_irt
 from bricktrack_host.neighbours import median_spacing
 from bricktrack_host.pixel_polynomials import PixelScaling, least_squares, monomials, n_terms, picture_grid
+from bricktrack_host.walking_pupil import fit_walking_pupil
 
-ModelKind = Literal["central", "two-plane"]
-ModelWish = Literal["auto", "central", "two-plane"]
+ModelKind = Literal["central", "walking-pupil", "two-plane"]
+ModelWish = Literal["auto", "central", "walking-pupil", "two-plane"]
 Planes = Sequence[tuple[float, DotObservations]]
 """Depth z, mm, and the dots seen there."""
 
@@ -42,8 +43,9 @@ OUTLIER_STEPS = 0.01
 MAX_OUTLIER_SHARE = 0.05
 """Past this share the dots are not a few smears: the grid is misread or the board is bent."""
 NOT_CENTRAL_P = 1e-3
-NOT_CENTRAL_GAIN = 0.9
-"""Two planes are taken only where they also predict unseen dots better, by this factor of the error."""
+NOT_CENTRAL_GAIN: dict[ModelKind, float] = {"walking-pupil": 1.0, "two-plane": 0.9}
+"""Another model is taken only where it is also expected to err less, by this factor. A walking pupil costs
+one number; two free planes cost twice as many as central rays and are no guide where a plane has no dots."""
 
 
 class CrossValidatedError(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -51,7 +53,7 @@ class CrossValidatedError(msgspec.Struct, frozen=True, kw_only=True, forbid_unkn
 
     Attributes
     ----------
-    model : "central" or "two-plane"
+    model : "central", "walking-pupil" or "two-plane"
     order : int
     rms_um : float, um
         Over the left-out dots of all planes, each as seen by the fit without its block.
@@ -78,7 +80,7 @@ class ModelChoice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     Attributes
     ----------
-    model : "central" or "two-plane"
+    model : "central", "walking-pupil" or "two-plane"
     order : int
     reason : str
         In words, for the report.
@@ -133,7 +135,7 @@ def calibrate_rays(
     planes : sequence of (float, DotObservations)
         With centroids as `bricktrack_host.dot_detection` measures them.
     sensor_mode : SensorMode
-    model : "auto", "central" or "two-plane", optional
+    model : "auto", "central", "walking-pupil" or "two-plane", optional
     order : int, optional
         Of the polynomials; cross-validated where not given.
     dot_diameter_mm : float, optional, mm
@@ -216,13 +218,13 @@ def choose_model(
     model: ModelWish = "auto",
     order: int | None = None,
 ) -> ModelChoice:
-    """Choose between central rays and two-plane IRT, and the order, by cross-validation and an F test.
+    """Choose between central rays, a walking pupil and two planes, and the order.
 
     Parameters
     ----------
     planes : sequence of (float, DotObservations)
     sensor_mode : SensorMode
-    model : "auto", "central" or "two-plane", optional
+    model : "auto", "central", "walking-pupil" or "two-plane", optional
         A model given is not questioned.
     order : int, optional
         An order given is not questioned.
@@ -230,16 +232,16 @@ def choose_model(
     Notes
     -----
     With ``model="two-plane"`` and no order, the source paper's order 5 is taken. For "auto", central rays of
-    order q are the special case of two planes of order q, so that under their truth
+    order q are the special case of either other model of order q, so that under their truth
     ``F = ((S_c - S_t) / (p_t - p_c)) / (S_t / (2 n - p_t))`` follows the F distribution; S are sums of
-    squares, each plane in units of its own scatter, p the numbers of parameters. Two planes are taken only if
-    the test rejects central rays *and* they predict left-out dots better: with many dots the test also
-    sees errors far below what matters.
+    squares, each plane in units of its own scatter, p the numbers of parameters. Another model is taken only
+    if the test rejects central rays *and* it is expected to err less over the picture: with many dots the
+    test also sees errors far below what matters.
     """
-    kinds: tuple[ModelKind, ...] = ("central", "two-plane") if model == "auto" else (model,)
+    kinds: tuple[ModelKind, ...] = ("central", "walking-pupil", "two-plane") if model == "auto" else (model,)
     if len(planes) > 2:
-        if model == "two-plane":
-            raise CalibrationError(f"{len(planes)} planes given; the two-plane model takes two")
+        if model not in ("auto", "central"):
+            raise CalibrationError(f"{len(planes)} planes given; the {model} model takes two")
         kinds = ("central",)
     orders = (order,) if order is not None else _affordable_orders(planes)
     candidates = []
@@ -266,17 +268,18 @@ def choose_model(
             ),
             candidates=tuple(candidates),
         )
-    central, two_plane = best["central"], best["two-plane"]
-    F, p = centrality_test(planes, max(central.order, two_plane.order), sensor_mode=sensor_mode)
+    central = best["central"]
+    other = min((best[kind] for kind in kinds if kind != "central"), key=lambda c: c.expected_um)
+    F, p = centrality_test(planes, max(central.order, other.order), other.model, sensor_mode=sensor_mode)
     rejected = p < NOT_CENTRAL_P
-    better = two_plane.rms_um < NOT_CENTRAL_GAIN * central.rms_um
-    chosen = two_plane if rejected and better else central
+    better = other.expected_um < NOT_CENTRAL_GAIN[other.model] * central.expected_um
+    chosen = other if rejected and better else central
     test = f"F test of a common centre p = {p:.2g}"
-    errors = f"left-out dots {central.rms_um:.2f} um central, {two_plane.rms_um:.2f} um two-plane"
-    if chosen is two_plane:
-        reason = f"two-plane: the rays do not meet in one point ({test}; {errors})"
+    errors = f"expected error {central.expected_um:.2f} um central, {other.expected_um:.2f} um {other.model}"
+    if chosen is other:
+        reason = f"{other.model}: the rays do not meet in one point ({test}; {errors})"
     elif rejected:
-        reason = f"central: two planes do not predict better, though the {test} ({errors})"
+        reason = f"central: {other.model} does not predict better, though the {test} ({errors})"
     else:
         reason = f"central: nothing speaks against one centre ({test}; {errors})"
     return ModelChoice(
@@ -289,20 +292,22 @@ def choose_model(
     )
 
 
-def centrality_test(planes: Planes, order: int, *, sensor_mode: SensorMode) -> tuple[float, float]:
-    """Return F and its p-value for central rays against two planes of the same order."""
+def centrality_test(
+    planes: Planes, order: int, against: ModelKind = "two-plane", *, sensor_mode: SensorMode
+) -> tuple[float, float]:
+    """Return F and its p-value for central rays against a model that has them as a special case."""
     central = fit_central_rays(planes, sensor_mode=sensor_mode, order=order)
-    two = _fit(planes, "two-plane", order, sensor_mode)
-    n = sum(len(dots) for _, dots in planes)
+    wider = _fit(planes, against, order, sensor_mode)
     m = n_terms(order)
-    p_two, p_central = 4 * m, 2 * m + 3
-    ratio = 0.0
-    for c, t in zip(central.residuals, two.residuals, strict=True):
-        scatter = t.n_dots * t.rms_um**2 / max(2 * (t.n_dots - m), 1)
+    p_wider, p_central = 4 * m if against == "two-plane" else 2 * m + 4, 2 * m + 3
+    ratio, freedom = 0.0, 0.0
+    for c, t in zip(central.residuals, wider.residuals, strict=True):
+        own_freedom = max(2 * t.n_dots - p_wider / 2, 1.0)
+        scatter = t.n_dots * t.rms_um**2 / own_freedom
         ratio += c.n_dots * (c.rms_um**2 - t.rms_um**2) / max(scatter, 1e-12)
-    freedom = max(2 * n - p_two, 1)
-    F = max(ratio, 0.0) / (p_two - p_central)
-    return F, float(f_distribution.sf(F, p_two - p_central, freedom))
+        freedom += own_freedom
+    F = max(ratio, 0.0) / (p_wider - p_central)
+    return F, float(f_distribution.sf(F, p_wider - p_central, freedom))
 
 
 def cross_validate(
@@ -317,6 +322,10 @@ def cross_validate(
     folds = [_folds(dots.uv_px, spacing_px) for _, dots in planes]
     if kind == "central":
         errors = central_rays.left_out_errors_mm(planes, folds, sensor_mode=sensor_mode, order=order)
+    elif kind == "walking-pupil":
+        errors = walking_pupil.left_out_errors_mm(
+            (planes[0], planes[1]), (folds[0], folds[1]), sensor_mode=sensor_mode, order=order
+        )
     else:
         errors = [
             irt.left_out_errors_mm(dots, fold, sensor_mode=sensor_mode, order=order)
@@ -340,8 +349,10 @@ def _fit(planes: Planes, kind: ModelKind, order: int, mode: SensorMode) -> Centr
     if kind == "central":
         return fit_central_rays(planes, sensor_mode=mode, order=order)
     if len(planes) != 2:
-        raise CalibrationError(f"{len(planes)} planes given; the two-plane model takes two")
+        raise CalibrationError(f"{len(planes)} planes given; the {kind} model takes two")
     (a_mm, dots_a), (b_mm, dots_b) = planes
+    if kind == "walking-pupil":
+        return fit_walking_pupil(dots_a, dots_b, a_mm=a_mm, b_mm=b_mm, sensor_mode=mode, order=order)
     return fit_two_plane_irt(dots_a, dots_b, a_mm=a_mm, b_mm=b_mm, sensor_mode=mode, order=order)
 
 

@@ -267,15 +267,29 @@ def test_a_pinhole_is_recognised_as_central(noisy_planes):
     assert 2.0 < best < 3.2
 
 
-def test_a_wandering_pupil_is_recognised_and_kept_as_two_planes():
+def test_a_walking_pupil_is_recognised_and_its_rays_are_true_without_dots():
     planes = [
         (A_MM, see(A_MM, noise_px=0.02, seed=1, wander_mm=3.0)),
         (B_MM, see(B_MM, noise_px=0.02, seed=2, wander_mm=3.0)),
     ]
     choice = choose_model(planes, sensor_mode=IMX219_1080P)
-    assert choice.model == "two-plane"
+    assert choice.model == "walking-pupil"
     assert choice.p_value is not None and choice.p_value < 1e-3
     assert "do not meet in one point" in choice.reason
+    fitted = calibrate_rays(planes, sensor_mode=IMX219_1080P, dot_diameter_mm=0.01)
+    # Noise of 0.02 px is 2 um at plane B; half of the picture has no dots there.
+    assert errors_um(fitted.model, B_MM, wander_mm=3.0).max() < 20.0
+    central = fit_central_rays(planes, sensor_mode=IMX219_1080P, order=7)
+    assert errors_um(central, B_MM, wander_mm=3.0).max() > 100.0
+
+
+def test_rays_that_meet_nowhere_are_kept_as_two_planes():
+    """The far board read 2 % too large and sheared: no pupil explains it, two free planes do."""
+    a, b = see(A_MM, noise_px=0.02, seed=1), see(B_MM, noise_px=0.02, seed=2)
+    bent = b.xy_mm + 2e-3 * np.stack([b.xy_mm[:, 1] ** 2 / 10, b.xy_mm[:, 0] * b.xy_mm[:, 1] / 10], axis=1)
+    b = DotObservations(b.uv_px, bent, b.cov_px2, b.area_px2, b.column_row)
+    choice = choose_model([(A_MM, a), (B_MM, b)], sensor_mode=IMX219_1080P)
+    assert choice.model == "two-plane"
 
 
 def test_the_test_of_centrality_is_fair():
