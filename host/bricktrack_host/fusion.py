@@ -48,6 +48,8 @@ from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 logger = logging.getLogger(__name__)
 
 _RUNS_AT_ONCE = 8  # 2000 nodes of four 21 x 21 matrices take 28 MB a run
+_FIRST_FRAMES = 15
+_FIRST_WITHIN_RAD = 0.3
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
 _MAX_SCALE_ROUNDS = 4
@@ -216,11 +218,14 @@ def _prepare(item: FusionInput) -> Run:
     )
 
 
-def _attitude_at_first_node(run: Run, nodes: Nodes, lin: Linearisation) -> FloatArray:
-    """Return the first frame's attitude carried back to the first node by the gyro."""
-    k = int(nodes.node_of_frame[0])
-    if k == 0:
-        return np.asarray(run.R_seen[0])
+def _attitude_at_first_node(run: Run, nodes: Nodes, lin: Linearisation) -> tuple[FloatArray, BoolArray]:
+    """Return the attitude at the first node that most of the early frames agree on, and which frames do.
+
+    The frames are carried back by the gyro. The filter's start is wide and would follow a false first pose
+    anywhere, so the early frames that disagree are not shown to it.
+    """
+    at = nodes.node_of_frame[:_FIRST_FRAMES]
+    k = max(int(at[-1]), 1)
     step = run.signal.increments(
         nodes.t_s[:k],
         nodes.t_s[1 : k + 1],
@@ -228,7 +233,13 @@ def _attitude_at_first_node(run: Run, nodes: Nodes, lin: Linearisation) -> Float
         acc_bias_mps2=lin.ba_mps2,
         acc_lag_s=lin.lag_s,
     )
-    return nearest_rotation(run.R_seen[0] @ chain_rotations(step.R)[-1].T)
+    since = np.concatenate([np.eye(3)[None], chain_rotations(step.R)])[at]
+    first = run.R_seen[: len(at)] @ np.swapaxes(since, 1, 2)
+    cosine = 0.5 * (np.einsum("iab,jab->ij", first, first) - 1)
+    best = int(np.argmax(np.median(cosine, axis=1)))
+    agrees = np.ones(len(run.t_cam_s), dtype=np.bool_)
+    agrees[: len(at)] = cosine[best] > np.cos(_FIRST_WITHIN_RAD)
+    return nearest_rotation(first[best]), agrees
 
 
 def _relinearise(estimate: Estimate, b: int, n_nodes: int, settings: FusionSettings) -> Linearisation:
@@ -346,12 +357,10 @@ def _fuse_together(
 ) -> list[FusionResult]:
     runs = [_prepare(item) for item in inputs]
     lins = [first_linearisation(run, settings) for run in runs]
-    used = [np.ones(len(run.t_cam_s), dtype=np.bool_) for run in runs]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
-    lins = [
-        replace(lin, R_first=_attitude_at_first_node(run, node, lin))
-        for run, node, lin in zip(runs, nodes, lins, strict=True)
-    ]
+    starts = [_attitude_at_first_node(*three) for three in zip(runs, nodes, lins, strict=True)]
+    lins = [replace(lin, R_first=R) for lin, (R, _) in zip(lins, starts, strict=True)]
+    used = [agrees for _, agrees in starts]
     scales, levels, estimate, chi2 = _settle_noise(runs, nodes, lins, used, settings)
     for b, far in enumerate(chi2):
         good = far < settings.gate_chi2

@@ -166,6 +166,17 @@ def test_outliers_are_left_out():
     assert rms_length(errors(s, r.track)[:, 3:]) < 0.15
 
 
+@pytest.mark.parametrize("false", [slice(0, 1), slice(60, 63)])
+def test_false_attitudes_at_the_start_or_in_a_burst_do_no_harm(false):
+    s = simulate_shake(47, duration_s=4.0)
+    R = s.optical.R_camera_brick.copy()
+    R[false] = Rotation.from_rotvec([0, 2.0, 0]).as_matrix() @ R[false]
+    r = fuse(replace(s.optical, R_camera_brick=R), s.imu, lever_arm_mm=LEVER_ARM_MM, output_t_ns=edges(s))
+    assert r.frame_rejected[false].all()
+    assert rms_length(errors(s, r.track)[:, 3:]) < 0.15
+    assert np.degrees(rms_length(errors(s, r.track)[:, :3])) < 0.1
+
+
 def test_optimistic_optical_covariance_is_noticed():
     s = simulate_shake(45, duration_s=5.0)
     told = replace(s.optical, covariance=s.optical.covariance / 9)
