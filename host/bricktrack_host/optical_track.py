@@ -29,6 +29,7 @@ from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 __all__ = ["SegmentMethod", "led_motion", "led_times_ns", "observe_leds", "solve_poses"]
 
 _PASSES = 4
+_SETTLED_MM = 1e-3
 _MAX_GAP_PERIODS = 3.5  # wider gaps end a spline: a shaken brick turns back within them
 _SPLINE_SHARE = 0.1
 _TWIST_FLOOR = np.array([0.005, 0.3])  # rad/s, mm/s: far below what moves a centroid within a frame
@@ -120,12 +121,17 @@ def solve_poses(
     poses, ambiguous = _other_starts(uv, cov, poses, t_ns, ray_model, brick_model, collar_mm)
     flags[ambiguous] |= PoseFlag.AMBIGUOUS
     known_motion = motion
-    for _ in range(_PASSES if rolling_shutter else 1):
+    for _ in range(_PASSES):
         if rolling_shutter and known_motion is None:
             motion = _motion_to_leds(t_ns, led_t_ns, poses)
-        poses = fit(uv, poses.R_camera_brick, poses.t_camera_brick_mm, motion)
+        before, n_before = poses.t_camera_brick_mm, int(all_finite(uv).sum())
+        poses = fit(uv, poses.R_camera_brick, before, motion)
         uv = _without_outliers(uv, poses)
-    poses = fit(uv, poses.R_camera_brick, poses.t_camera_brick_mm, motion)
+        moved_mm = np.abs(poses.t_camera_brick_mm - before)
+        if int(all_finite(uv).sum()) == n_before and not (moved_mm > _SETTLED_MM).any():
+            break
+    else:
+        poses = fit(uv, poses.R_camera_brick, poses.t_camera_brick_mm, motion)
     return _finish(
         observations,
         t_ns,
