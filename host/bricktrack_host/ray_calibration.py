@@ -244,8 +244,17 @@ def choose_model(
             raise CalibrationError(f"{len(planes)} planes given; the {model} model takes two")
         kinds = ("central",)
     orders = (order,) if order is not None else _affordable_orders(planes)
-    candidates = []
+    candidates: list[CrossValidatedError] = []
     for kind in kinds:
+        if kind == "walking-pupil" and model == "auto":
+            # The costliest fit, and near to the central one: the orders next to that one's best suffice.
+            best_central = min(candidates, key=lambda c: c.expected_um).order
+            candidates += [
+                cross_validate(planes, kind, q, sensor_mode=sensor_mode)
+                for q in orders
+                if abs(q - best_central) <= 2
+            ]
+            continue
         only_paper = model == "two-plane" and order is None and PAPER_ORDER in orders
         for q in (PAPER_ORDER,) if only_paper else orders:
             candidates.append(cross_validate(planes, kind, q, sensor_mode=sensor_mode))

@@ -3,8 +3,8 @@
 The steeper a ray, the farther along the axis it crosses it:
 ``(x, y) = (x0, y0) + (z - z0 - w |P|^2) P(u, v)``, P the slopes, w the walk in mm at slope 1. With w = 0
 these are `bricktrack_host.central_rays`. One polynomial still serves both planes, so the rays hold where the
-far plane had no dots; free polynomials for each plane (`bricktrack_host.irt`) do not. The result is stored as an
-ordinary `TwoPlaneIrt` of a somewhat higher order, into which ``|P|^2 P`` is expanded.
+far plane had no dots; free polynomials for each plane (`bricktrack_host.irt`) do not. The result is stored as
+an ordinary `TwoPlaneIrt` of a somewhat higher order, into which ``|P|^2 P`` is expanded.
 """
 
 from dataclasses import dataclass
