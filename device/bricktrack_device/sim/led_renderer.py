@@ -1,35 +1,42 @@
-"""Pictures of glowing domes: each pixel's ray is cast against each LED when its row was exposed.
+"""Pictures of glowing domes: each pixel's ray is cast against each LED while its row is exposed.
 
-A dome is a hemisphere on a lit cylinder, the collar. Only the windows around LEDs are drawn anew for each
-frame; the surroundings come from a few noisy pictures made once. Grey levels are BT.601 limited range, as from
-the encoder's own converter; the LEDs are white, so the chroma planes are constant.
+Only windows around the LEDs are computed for each frame; the surroundings are `scene`'s. The LEDs are
+white, so the chroma planes are constant.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bricktrack_common.arrays import FloatArray
+from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.camera_model import SensorMode
+from bricktrack_device.sim.dome import clearance_mm
 from bricktrack_device.sim.lens import Lens
+from bricktrack_device.sim.scene import BAND_ROWS, LIGHT_OF_LUMA, Plane, Scene, Single, noise_sd, to_luma
 from bricktrack_device.sim.settings import SimSettings
 from bricktrack_device.sim.world import SimWorld
 
-Plane = NDArray[np.uint8]
-_Single = NDArray[np.float32]
-
-_N_SURROUNDINGS = 6
-_N_INSTANTS = 48  # of the pose over a frame's read-out: 0.5 ms apart, between which it is taken as linear
-_PSF_SIGMA_PX = 1.1
-_MARGIN_PX = 8
-_READ_NOISE = 0.004
-_SHOT_NOISE = 0.006
-_LIMB = 0.3  # how much darker the dome's rim is than its middle
-_SUB_PIXEL = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-_LEVELS = 4096
+_POSE_STEP_ROWS = 4  # poses are taken every 76 us and linear between: 0.2 um at 30 g
+_PSF_SIGMA_PX = 0.8
+_APERTURE_MM = 1.5  # f/2 of 3.04 mm
+_FOCUS_MM = 126.0
+_LIMB = 0.3  # how much darker the rim is than the middle
+_BEZEL_RADII = 1.45
+_MAX_INSTANTS = 12
+_BLUR_STEP_PX = 0.8
+_CARD_TILT = 0.15
+_CARD_EDGE_PX = 12.0  # out of focus
 
 
 class LedRenderer:
-    """Draws the luma plane of frames; chroma planes never change."""
+    """Draws the luma plane of frames; chroma planes never change.
+
+    Parameters
+    ----------
+    settings : SimSettings
+    world : SimWorld
+    lens : Lens
+    mode : SensorMode
+    exposure_ns : int
+    """
 
     def __init__(
         self, settings: SimSettings, world: SimWorld, *, lens: Lens, mode: SensorMode, exposure_ns: int
@@ -39,15 +46,23 @@ class LedRenderer:
         self._lens = lens
         self._mode = mode
         self._exposure_ns = exposure_ns
-        self._directions = lens.directions.astype(np.float32)
+        slopes = lens.pixel_slopes
+        self._x, self._y = (np.ascontiguousarray(slopes[..., i], dtype=np.float32) for i in (0, 1))
+        delays_ns = mode.row_delay_ns(np.arange(mode.height))
+        self._first_delay_ns = float(delays_ns.min())
+        self._step_ns = _POSE_STEP_ROWS * mode.line_time_ns
+        # When rows' exposures begin, in steps of the pose grid; mid-exposure is half an exposure later.
+        self._row_start = (delays_ns - self._first_delay_ns) / self._step_ns
+        self._exposure_steps = exposure_ns / self._step_ns
+        self._n_steps = int(np.ceil(self._row_start.max() + self._exposure_steps)) + 2
+        brick = world.brick
+        R, t_mm = world.rest_pose
+        centres = brick.led_positions_mm @ R.T + t_mm
+        self._rest_uv = lens.project(centres)
+        radius_px = float(brick.led_radii_mm.max() * lens.focal_px / centres[:, 2].min())
+        self._scene = Scene(settings, lens, led_uv_px=self._rest_uv, led_radius_px=radius_px)
         self._rng = np.random.default_rng([settings.seed, 2])
-        self._luma_of_light = _transfer()
-        light = _surroundings(lens, settings)
-        self._light = light.astype(np.float32)
-        self._pictures = [self._expose(light) for _ in range(_N_SURROUNDINGS)]
-        self._card = self._expose(np.full_like(light, 0.002))
-        self._noise = self._rng.standard_normal((1 << 20) + 7).astype(np.float32)
-        self._n_drawn = 0
+        self._noise = self._rng.standard_normal(1 << 20, dtype=np.float32)
         half = (mode.height // 2, mode.width // 2)
         self.chroma_u: Plane = np.full(half, 128, dtype=np.uint8)
         self.chroma_v: Plane = np.full(half, 128, dtype=np.uint8)
@@ -55,158 +70,123 @@ class LedRenderer:
     def luma(self, sensor_timestamp_ns: int) -> Plane:
         """Return the luma plane (height, width) of the frame whose read-out starts at this instant.
 
-        Row v is exposed from ``stamp + v line_time - exposure`` to ``stamp + v line_time``.
+        Row v is exposed from ``stamp + delay(v) - exposure`` to ``stamp + delay(v)``.
         """
-        mode = self._mode
-        span = self._exposure_ns + float(mode.row_delay_ns(mode.height))
-        start = sensor_timestamp_ns - self._exposure_ns
-        self._instants_ns = start + np.rint(np.linspace(0, span, _N_INSTANTS)).astype(np.int64)
-        self._n_drawn += 1
-        middle = np.array([sensor_timestamp_ns - self._exposure_ns // 2], dtype=np.int64)
-        if self._world.view_is_covered(middle)[0]:
-            return self._card.copy()
-        picture = self._pictures[self._n_drawn % _N_SURROUNDINGS].copy()
-        self._R, self._t = (a.astype(np.float64) for a in self._world.pose(self._instants_ns))
-        hidden = self._world.hidden_leds(int(middle[0]))
-        for i, name in enumerate(self._world.brick.led_names):
-            if name not in hidden:
-                self._draw(picture, i)
+        start_ns = sensor_timestamp_ns - self._exposure_ns + self._first_delay_ns
+        grid_ns = round(start_ns) + np.rint(np.arange(self._n_steps) * self._step_ns).astype(np.int64)
+        cover = self._world.card_cover(grid_ns)
+        if cover.min() >= 1:
+            return self._scene.card.copy()
+        R, t_mm = self._world.pose(grid_ns)
+        centres = np.einsum("nij,lj->nli", R, self._world.brick.led_positions_mm) + t_mm[:, None]
+        axes = np.einsum("nij,lj->nli", R, self._world.brick.led_axes)
+        uv = self._lens.project(centres)
+        picture = self._scene.picture(self._wall_shifts(uv))
+        lit = np.where(self._world.leds_hidden(grid_ns), 0.0, 1.0)
+        for i in range(centres.shape[1]):
+            if lit[:, i].any():
+                self._draw(picture, i, centres[:, i], axes[:, i], uv[:, i], lit[:, i])
+        if cover.max() > 0:
+            self._draw_card(picture, self._at(cover[:, None], np.arange(self._mode.height), 0.5)[:, 0])
         return picture
 
-    def _draw(self, picture: Plane, i_led: int) -> None:
-        brick = self._world.brick
-        radius = float(brick.led_radii_mm[i_led])
-        centres = np.einsum("nij,j->ni", self._R, brick.led_positions_mm[i_led]) + self._t
-        uv = self._lens.project(centres[:: _N_INSTANTS // 6])
-        reach = 1.15 * radius * self._lens.focal_px / centres[:, 2].min() + _MARGIN_PX
-        u0, v0 = np.maximum(np.floor(uv.min(axis=0) - reach), 0).astype(int)
-        u1 = min(int(np.ceil(uv[:, 0].max() + reach)) + 1, self._mode.width)
-        v1 = min(int(np.ceil(uv[:, 1].max() + reach)) + 1, self._mode.height)
-        if u1 - u0 < 3 or v1 - v0 < 3:
-            return
-        axis = brick.led_axes[i_led]
-        d = self._directions[v0:v1, u0:u1]
-        # Rows and columns of neighbouring pixels' directions give those of sub-pixel points.
-        du, dv = np.gradient(d, axis=1), np.gradient(d, axis=0)
-        rows = np.arange(v0, v1)
-        lit = np.zeros(d.shape[:2], dtype=np.float32)
-        for k, (off_u, off_v) in enumerate(_SUB_PIXEL):
-            share = (k + 0.5) / len(_SUB_PIXEL)
-            R, t = self._pose_of_rows(rows + off_v, share)
-            to_led = np.einsum("nij,j->ni", R, brick.led_positions_mm[i_led]) + t
-            lit += _dome_light(
-                d + np.float32(off_u) * du + np.float32(off_v) * dv,
-                to_led.astype(np.float32),
-                np.einsum("nij,j->ni", R, axis).astype(np.float32),
-                radius,
-                self._settings.collar_mm,
-            )
-        light = self._light[v0:v1, u0:u1]
-        blurred = _blur(lit / np.float32(len(_SUB_PIXEL)))
-        light = light * (1 - np.minimum(blurred, 1)) + np.float32(self._settings.led_level) * blurred
-        picture[v0:v1, u0:u1] = self._digitise(light)
+    def _wall_shifts(self, uv: FloatArray) -> IntArray:
+        rows = np.arange(BAND_ROWS // 2, self._mode.height + BAND_ROWS, BAND_ROWS)
+        rows = np.minimum(rows[: -(-self._mode.height // BAND_ROWS)], self._mode.height - 1)
+        moved = uv.mean(axis=1) - self._rest_uv.mean(axis=0)
+        return np.rint(self._at(moved, rows, 0.5)).astype(np.int64)
 
-    def _pose_of_rows(self, rows: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
-        """Return the poses at which rows stood when ``share`` of their exposure was over."""
-        delay = self._mode.row_delay_ns(rows)
-        span = float(self._instants_ns[-1] - self._instants_ns[0])
-        x = np.clip((delay + share * self._exposure_ns) / span, 0, 1) * (_N_INSTANTS - 1)
-        i = np.minimum(x.astype(int), _N_INSTANTS - 2)
+    def _at(self, values: FloatArray, rows: IntArray, share: float) -> FloatArray:
+        """Return ``values`` (steps, k) at the time when ``share`` of the exposure of each row was over."""
+        x = self._row_start[rows] + share * self._exposure_steps
+        i = np.minimum(x.astype(int), self._n_steps - 2)
         f = (x - i)[:, None]
-        t = (1 - f) * self._t[i] + f * self._t[i + 1]
-        R = (1 - f[..., None]) * self._R[i] + f[..., None] * self._R[i + 1]
-        return R, t
+        return np.asarray((1 - f) * values[i] + f * values[i + 1])
 
-    def _expose(self, light: FloatArray) -> Plane:
-        noise = self._rng.standard_normal(light.shape, dtype=np.float32)
-        return self._to_luma(light.astype(np.float32), noise)
+    def _window(self, uv: FloatArray, reach_px: float) -> tuple[int, int, int, int, float] | None:
+        """Return u0, u1, v0, v1 of the rows and columns that the LED touches, and its blur in px."""
+        rows = np.arange(self._mode.height)
+        middle = self._row_start + 0.5 * self._exposure_steps
+        order = np.argsort(middle)
+        row_of_step = np.interp(np.arange(self._n_steps), middle[order], rows[order])
+        exposure_rows = 0.5 * self._exposure_steps * _POSE_STEP_ROWS
+        near = np.abs(row_of_step - uv[:, 1]) < reach_px + exposure_rows + 2 * _POSE_STEP_ROWS
+        if near.sum() < 2:
+            return None
+        path = uv[near]
+        u0, v0 = np.maximum(np.floor(path.min(axis=0) - reach_px), 0).astype(int).tolist()
+        u1, v1 = np.minimum(
+            np.ceil(path.max(axis=0) + reach_px) + 1, [self._mode.width, self._mode.height]
+        ).astype(int)
+        if u1 - u0 < 3 or v1 - v0 < 3:
+            return None
+        speed = np.linalg.norm(np.diff(path, axis=0), axis=1).max()
+        return u0, u1, v0, v1, float(speed) * self._exposure_steps
 
-    def _digitise(self, light: _Single) -> Plane:
-        start = (
-            int(self._rng.integers(0, self._noise.size - light.size)) if light.size < self._noise.size else 0
+    def _draw(
+        self,
+        picture: Plane,
+        i_led: int,
+        centres: FloatArray,
+        axes: FloatArray,
+        uv: FloatArray,
+        lit: FloatArray,
+    ) -> None:
+        brick, level = self._world.brick, np.float32(self._settings.led_level)
+        radius, collar = float(brick.led_radii_mm[i_led]), self._settings.collar_mm
+        facing = -np.einsum("nj,nj->n", axes, centres) / np.linalg.norm(centres, axis=1)
+        if facing.min() < 0.05:
+            return  # it looks past the camera
+        z_mm = float(centres[:, 2].mean())
+        window = self._window(uv, 1.2 * _BEZEL_RADII * radius * self._lens.focal_px / z_mm + 6)
+        if window is None:
+            return
+        u0, u1, v0, v1, blur_px = window
+        rows = np.arange(v0, v1)
+        x, y = self._x[v0:v1, u0:u1], self._y[v0:v1, u0:u1]
+        slope_a_px = np.sqrt(
+            abs((x[-1, -1] - x[-1, 0]) * (y[-1, 0] - y[0, 0])) / ((u1 - u0 - 1) * (v1 - v0 - 1))
         )
-        return self._to_luma(light, np.resize(self._noise[start : start + light.size], light.shape))
+        px_per_mm = np.float32(1 / (slope_a_px * z_mm))
+        out_of_focus_px = self._lens.focal_px * _APERTURE_MM * abs(1 / z_mm - 1 / _FOCUS_MM)
+        soft_px = np.float32(0.5 + np.hypot(1.8 * _PSF_SIGMA_PX, 0.5 * out_of_focus_px))
 
-    def _to_luma(self, light: _Single, noise: _Single) -> Plane:
-        sd = np.float32(self._settings.noise) * np.sqrt(_READ_NOISE**2 + _SHOT_NOISE**2 * light)
-        level = np.clip((light + sd * noise) * (_LEVELS - 1), 0, _LEVELS - 1).astype(np.uint16)
-        return np.asarray(self._luma_of_light[level])
+        n = int(np.clip(np.ceil(blur_px / _BLUR_STEP_PX), 1, _MAX_INSTANTS))
+        covered, glow, shade = (np.zeros(x.shape, dtype=np.float32) for _ in range(3))
+        moving = np.concatenate([centres, axes, lit[:, None]], axis=1)
+        for k in range(n):
+            now = self._at(moving, rows, (k + 0.5) / n).astype(np.float32)
+            deep, from_axis = clearance_mm(x, y, now[:, :3], now[:, 3:6], radius_mm=radius, collar_mm=collar)
+            share = _edge(deep * px_per_mm, soft_px) * now[:, 6:]
+            from_middle = 1 - np.clip(deep / np.float32(radius), 0, 1)
+            bright = 1 - np.float32(_LIMB) * (1 - np.sqrt(np.maximum(1 - from_middle * from_middle, 0)))
+            if k == n // 2:
+                shade = _edge((np.float32(_BEZEL_RADII * radius) - from_axis) * px_per_mm, np.float32(2))
+            covered += share
+            glow += share * bright
+        behind = LIGHT_OF_LUMA[picture[v0:v1, u0:u1]] * (1 - np.float32(0.9) * shade)
+        fall_off = 1 / (1 + x * x + y * y)  # the lens is darker towards the corners
+        led: Single = np.asarray(level / np.float32(n) * glow * fall_off, dtype=np.float32)
+        first = int(self._rng.integers(0, self._noise.size - x.size))
+        noise = self._noise[first : first + x.size].reshape(x.shape)
+        grain = noise_sd(led, self._settings) * noise * (covered > 0)
+        light = np.asarray(behind * (1 - covered / np.float32(n)) + led + grain, dtype=np.float32)
+        picture[v0:v1, u0:u1] = to_luma(light)
 
-
-def _dome_light(d: _Single, centre: _Single, axis: _Single, radius: float, collar_mm: float) -> _Single:
-    """Return the light (rows, columns) of one dome seen along unit rays from the origin.
-
-    ``d`` is (rows, columns, 3); ``centre`` and ``axis`` are (rows, 3): the brick moves from row to row.
-    """
-    c, a = centre[:, None, :], axis[:, None, :]
-    along = np.einsum("rci,rki->rc", d, c)  # distance to the point of the ray nearest to the centre
-    cc = np.einsum("rki,rki->rk", c, c)
-    half2 = along**2 - (cc - np.float32(radius**2))
-    hit = half2 > 0
-    half = np.sqrt(np.maximum(half2, 0))
-    s = along - half
-    da, ca = np.einsum("rci,rki->rc", d, a), np.einsum("rki,rki->rk", c, a)
-    height = s * da - ca  # of the point of entry above the plane through the sphere's centre
-    dome = hit & (height >= 0)
-    facing = half / np.float32(radius)
-    light = np.where(dome, 1 - np.float32(_LIMB) * (1 - facing), np.float32(0))
-    if collar_mm > 0:
-        # The cylinder: the same in the plane across the axis.
-        A = np.maximum(1 - da**2, np.float32(1e-6))
-        B = along - da * ca
-        C = cc - ca**2 - np.float32(radius**2)
-        disc = B**2 - A * C
-        side = np.sqrt(np.maximum(disc, 0))
-        h = (B - side) / A * da - ca
-        wall = (disc > 0) & (h <= 0) & (h >= -np.float32(collar_mm)) & ~dome
-        facing = side / (np.sqrt(A) * np.float32(radius))
-        light = np.where(wall, 1 - np.float32(_LIMB) * (1 - np.clip(facing, 0, 1)), light)
-    return np.asarray(light, dtype=np.float32)
-
-
-def _blur(image: _Single) -> _Single:
-    """Return the image through the lens's point spread, a Gaussian."""
-    x = np.arange(-3, 4, dtype=np.float32)
-    kernel = np.exp(-0.5 * (x / np.float32(_PSF_SIGMA_PX)) ** 2)
-    kernel /= kernel.sum()
-    out = image
-    for axis in (0, 1):
-        padded = np.pad(out, [(3, 3) if a == axis else (0, 0) for a in (0, 1)])
-        n = out.shape[axis]
-        parts = [padded[k : k + n] if axis == 0 else padded[:, k : k + n] for k in range(7)]
-        out = sum((w * p for w, p in zip(kernel, parts, strict=True)), np.zeros_like(out))
-    return out
+    def _draw_card(self, picture: Plane, cover: FloatArray) -> None:
+        """Slide the card in from the left; 1 covers the whole picture."""
+        half = _CARD_EDGE_PX + 0.5 * _CARD_TILT * self._mode.height
+        rows = np.arange(self._mode.height)
+        edge = -half + cover * (self._mode.width + 2 * half) + _CARD_TILT * (rows - self._mode.height / 2)
+        u = np.arange(self._mode.width, dtype=np.float32)
+        share = _edge(edge.astype(np.float32)[:, None] - u, np.float32(_CARD_EDGE_PX))
+        there = picture.astype(np.float32)
+        there += share * (self._scene.card - there)
+        np.rint(there, out=there)
+        picture[:] = there.astype(np.uint8)
 
 
-def _transfer() -> Plane:
-    """Return the table from linear light to BT.601 limited luma through the Rec. 709 curve."""
-    light = np.arange(_LEVELS) / (_LEVELS - 1)
-    curve = np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
-    return np.rint(16 + 219 * curve).astype(np.uint8)
-
-
-def _surroundings(lens: Lens, settings: SimSettings) -> FloatArray:
-    """Return the linear light of everything but the LEDs: a dark wall, mottled, with a few reflections."""
-    rng = np.random.default_rng([settings.seed, 3])
-    coarse = rng.uniform(0.2, 1.0, (lens.height // 40 + 2, lens.width // 40 + 2))
-    mottled = np.repeat(np.repeat(coarse, 40, axis=0), 40, axis=1)[: lens.height, : lens.width]
-    for axis in (0, 1):
-        padded = np.pad(mottled, [(31, 30) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        total = np.cumsum(padded, axis=axis)
-        n = mottled.shape[axis]
-        mottled = (np.take(total, range(61, 61 + n), axis) - np.take(total, range(n), axis)) / 61
-    v, u = np.mgrid[0 : lens.height, 0 : lens.width].astype(np.float64)
-    radius2 = ((u - lens.width / 2) ** 2 + (v - lens.height / 2) ** 2) / (lens.width / 2) ** 2
-    light = 0.012 * settings.clutter * mottled * (1 - 0.3 * radius2)
-    for _ in range(5):  # reflections: smaller than an LED, and drawn out
-        at = rng.uniform([60, 60], [lens.width - 60, lens.height - 60])
-        size = rng.uniform([5, 2], [14, 6])
-        turn = rng.uniform(0, np.pi)
-        x, y = u - at[0], v - at[1]
-        along, across = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
-        light += (
-            0.5
-            * min(settings.clutter, 1.5)
-            * np.exp(-(((along / size[0]) ** 2 + (across / size[1]) ** 2) ** 2))
-        )
-    return np.asarray(light)
+def _edge(inside_px: Single, half_width_px: np.float32) -> Single:
+    """Return a smooth step from 0 to 1 over an edge, symmetric about 0."""
+    t = np.clip(np.float32(0.5) + inside_px * (np.float32(0.5) / half_width_px), 0, 1)
+    return np.asarray(t * t * (3 - 2 * t))

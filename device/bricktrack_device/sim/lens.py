@@ -11,13 +11,16 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray
 
+_STEP_PX = 8  # of the coarse grid under `Lens.pixel_slopes`; cubic between, the error is below 1e-4 px
+_TOLERANCE = 1e-12
+
 
 @dataclass(frozen=True)
 class Lens:
     """A projection centre with distortion after Brown and Conrady.
 
-    A point (X, Y, Z) of the camera frame has slopes ``x = X/Z, y = Y/Z``; with ``r2 = x^2 + y^2`` it is seen
-    at ``u = cx + f (x (1 + k1 r2 + k2 r2^2 + k3 r2^3) + 2 p1 x y + p2 (r2 + 2 x^2))`` and likewise v.
+    A point (X, Y, Z) of the camera frame has slopes ``x = X/Z, y = Y/Z``; with ``r2 = x^2 + y^2`` it is
+    seen at ``u = cx + f (x (1 + k1 r2 + k2 r2^2 + k3 r2^3) + 2 p1 x y + p2 (r2 + 2 x^2))`` and likewise v.
     """
 
     width: int = 1920
@@ -44,36 +47,55 @@ class Lens:
         return np.stack([self.cx_px + self.focal_px * xd, self.cy_px + self.focal_px * yd], axis=-1)
 
     def slopes(self, uv_px: FloatArray) -> FloatArray:
-        """Return the slopes (x/z, y/z) that pixels (..., 2) see, by fixed-point iteration to 1e-9."""
-        target = (uv_px - [self.cx_px, self.cy_px]) / self.focal_px
+        """Return the slopes (x/z, y/z) that pixels (..., 2) see, by fixed-point iteration to 1e-12."""
+        centre = np.array([self.cx_px, self.cy_px])
+        target = (uv_px - centre) / self.focal_px
         s = target.copy()
-        for _ in range(40):
-            error = target - (self._pixel_of(s) - [self.cx_px, self.cy_px]) / self.focal_px
+        for _ in range(60):
+            error = target - (self._pixel_of(s) - centre) / self.focal_px
             s = s + error
-            if np.abs(error).max() < 1e-9:
+            if np.abs(error).max() < _TOLERANCE:
                 break
         return np.asarray(s)
 
     @cached_property
-    def directions(self) -> FloatArray:
-        """Unit ray directions of all pixel centres, shape (height, width, 3)."""
-        step = 8  # the map is smooth: bilinear between every eighth pixel errs by less than 1e-3 px
-        v, u = np.mgrid[0 : self.height + step : step, 0 : self.width + step : step].astype(np.float64)
-        coarse = self.slopes(np.stack([u, v], axis=-1))
-        fine = _upsample(_upsample(coarse, step, axis=0), step, axis=1)[: self.height, : self.width]
-        d = np.concatenate([fine, np.ones((*fine.shape[:2], 1))], axis=-1)
-        d /= np.linalg.norm(d, axis=-1, keepdims=True)
-        return np.asarray(d)
+    def pixel_slopes(self) -> FloatArray:
+        """What every pixel centre sees: slopes (x/z, y/z), shape (height, width, 2)."""
+        step = _STEP_PX
+        # One more knot on every side, so that the cubic never extrapolates.
+        rows = np.arange(-step, self.height + 2 * step, step, dtype=np.float64)
+        columns = np.arange(-step, self.width + 2 * step, step, dtype=np.float64)
+        coarse = self.slopes(np.stack(np.meshgrid(columns, rows), axis=-1))
+        fine = _cubic_between(_cubic_between(coarse, step, axis=0), step, axis=1)
+        return np.ascontiguousarray(fine[: self.height, : self.width])
 
 
-def _upsample(a: FloatArray, step: int, *, axis: int) -> FloatArray:
-    """Return cubic (Catmull-Rom) interpolation between samples ``step`` apart."""
+def lens_of(seed: int) -> Lens:
+    """Return the lens of the unit with this seed: no two are quite alike.
+
+    Examples
+    --------
+    >>> lens_of(1) == lens_of(1), lens_of(1) == lens_of(2)
+    (True, False)
+    """
+    rng = np.random.default_rng([seed, 8])
+    d = rng.uniform(-1, 1, 6)
+    return Lens(
+        focal_px=round(1652.0 * (1 + 0.008 * d[0]), 3),
+        cx_px=round(959.5 + 12 * d[1], 3),
+        cy_px=round(539.5 + 12 * d[2], 3),
+        k1=round(-0.118 * (1 + 0.06 * d[3]), 6),
+        p1=round(8.0e-4 * d[4], 7),
+        p2=round(8.0e-4 * d[5], 7),
+    )
+
+
+def _cubic_between(a: FloatArray, step: int, *, axis: int) -> FloatArray:
+    """Return Catmull-Rom interpolation, ``step`` samples a knot, from the second knot to the last but one."""
     a = np.moveaxis(a, axis, 0)
-    padded = np.concatenate([2 * a[:1] - a[1:2], a, 2 * a[-1:] - a[-2:-1]])
-    p0, p1, p2, p3 = padded[:-3], padded[1:-2], padded[2:-1], padded[3:]
+    p0, p1, p2, p3 = (p[:, None] for p in (a[:-3], a[1:-2], a[2:-1], a[3:]))
     t = (np.arange(step) / step).reshape(1, step, *([1] * (a.ndim - 1)))
-    p0, p1, p2, p3 = (p[:, None] for p in (p0, p1, p2, p3))
-    out = 0.5 * (
-        2 * p1 + t * (p2 - p0) + t**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + t**3 * (3 * p1 - p0 - 3 * p2 + p3)
+    out = p1 + 0.5 * (
+        t * (p2 - p0) + t**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + t**3 * (3 * p1 - p0 - 3 * p2 + p3)
     )
     return np.moveaxis(out.reshape(-1, *a.shape[1:]), 0, axis)

@@ -1,8 +1,8 @@
 """Motions of the simulated brick: six coordinates as functions of time, with exact derivatives.
 
 A motion maps seconds since the shake's start to ``[x, y, z]`` in mm and a rotation vector in rad, and their
-first and second derivatives, each of shape (n, 6). Everything is at rest before 0 and after the end, and twice
-continuously differentiable, so that the inertial sensor and the camera see one and the same motion.
+first and second derivatives, each of shape (n, 6). Everything is at rest before 0 and after the end, and
+twice continuously differentiable, so that the inertial sensor and the camera see one and the same motion.
 """
 
 import csv

@@ -20,4 +20,4 @@ PAPER_LAYOUT = LayoutFile(
     ],
     imu=ImuEntry(lever_arm_mm=(26.045, 53.0, 14.199)),
 )
-"""Positions of the domes' sphere centres, axes out of the wall, and the lever arm (the paper, section 7.3)."""
+"""Positions of the domes' sphere centres, axes out of the wall, and the lever arm (paper, section 7.3)."""

@@ -19,8 +19,9 @@ from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_manifest import CameraSection
 from bricktrack_device.interfaces import EncodedPacket, FrameMetadata, FrameSink
-from bricktrack_device.sim.led_renderer import LedRenderer, Plane
-from bricktrack_device.sim.lens import Lens
+from bricktrack_device.sim.led_renderer import LedRenderer
+from bricktrack_device.sim.lens import lens_of
+from bricktrack_device.sim.scene import Plane
 from bricktrack_device.sim.world import SimWorld
 
 if TYPE_CHECKING:
@@ -54,7 +55,11 @@ class SimCamera:
         lines = round(LINES_A_FRAME * _SENSOR_FRAME_RATE_HZ / s.frame_rate_hz)
         period_ns = lines * mode.line_time_ns
         renderer = LedRenderer(
-            self._world.settings, self._world, lens=Lens(), mode=mode, exposure_ns=exposure_us * 1000
+            self._world.settings,
+            self._world,
+            lens=lens_of(self._world.settings.seed),
+            mode=mode,
+            exposure_ns=exposure_us * 1000,
         )
         encoder, encoder_settings = _open_encoder(s, mode.width, mode.height)
         self._stopping.clear()

@@ -9,7 +9,7 @@ from av.video.frame import VideoFrame
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.camera_model import IMX219_1080P
-from bricktrack_device.sim.lens import Lens
+from bricktrack_device.sim.lens import Lens, lens_of
 from bricktrack_device.sim.settings import SimSettings
 from bricktrack_device.sim.world import load_layout
 
@@ -49,14 +49,14 @@ line_time_us = {line_time_us}
 def write_sim_kit(folder: Path, settings: SimSettings) -> list[Path]:
     """Write ``layout.toml``, ``rig.toml``, ``calib_A.png`` and ``calib_B.png``; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    lens = Lens()
+    lens = lens_of(settings.seed)
     layout = folder / "layout.toml"
     layout.write_text(_layout_text(settings), encoding="utf-8")
     rig = folder / "rig.toml"
     rig.write_text(
         _RIG.format(
-            a=PLANES_MM["A"], b=PLANES_MM["B"], pitch=PITCH_MM, diameter=DOT_DIAMETER_MM, u=lens.cx_px, v=lens.cy_px,
-            columns=COLUMNS, rows=ROWS, width=lens.width, height=lens.height,
+            a=PLANES_MM["A"], b=PLANES_MM["B"], pitch=PITCH_MM, diameter=DOT_DIAMETER_MM, u=lens.cx_px,
+            v=lens.cy_px, columns=COLUMNS, rows=ROWS, width=lens.width, height=lens.height,
             line_time_us=IMX219_1080P.line_time_ns / 1000,
         ),
         encoding="utf-8",
@@ -75,7 +75,7 @@ def target_picture(lens: Lens, z_mm: float, rng: np.random.Generator, *, noise: 
     light = np.zeros((lens.height, lens.width))
     offsets = (np.arange(_SUB) + 0.5) / _SUB - 0.5
     v, u = np.mgrid[0 : lens.height, 0 : lens.width].astype(np.float64)
-    base = lens.directions[..., :2] / lens.directions[..., 2:] * z_mm
+    base = lens.pixel_slopes * z_mm
     du, dv = np.gradient(base, axis=1), np.gradient(base, axis=0)
     for off_v in offsets:
         for off_u in offsets:
@@ -116,7 +116,8 @@ def _layout_text(settings: SimSettings) -> str:
         return Path(settings.layout).read_text(encoding="utf-8")
     brick = load_layout(settings)
     lines = [
-        "# The brick of a simulated unit: the paper's seven LEDs. Brick frame, mm: origin m0, x right, y down.",
+        "# The brick of a simulated unit: the paper's seven LEDs.",
+        "# Brick frame, mm: origin m0, x right, y down.",
         f'name = "{brick.name}"',
         "",
         "[led_profile]",

@@ -1,7 +1,7 @@
 """The simulated trigger line: gpiozero's mock pins, driven by a square wave with kernel-like stamps.
 
-An edge is stamped with the instant of the wave, not with that of the thread that delivers it, as a kernel stamps in
-its interrupt and reports later.
+An edge is stamped with the instant of the wave, not with that of the thread that delivers it, as a kernel
+stamps in its interrupt and reports later.
 """
 
 import threading

@@ -1,7 +1,7 @@
 """The world that every simulated sensor asks: where the brick is, what hides it, when the wave rises.
 
-It is a deterministic function of its settings and of CLOCK_MONOTONIC; only the instant of the first edge is shared
-between processes, because arming decides it.
+It is a deterministic function of its settings and of CLOCK_MONOTONIC; only the instant of the first edge is
+shared between processes, because arming decides it.
 """
 
 import multiprocessing
@@ -13,21 +13,23 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel, brick_model_from_file, load_brick_model
+from bricktrack_common.errors import ConfigError
 from bricktrack_common.rotations import matrix_from_rvec, right_jacobian, skew
 from bricktrack_device.sim.motions import make_motion
 from bricktrack_device.sim.paper_layout import PAPER_LAYOUT
 from bricktrack_device.sim.settings import SimSettings
 
-_REST_T_MM = np.array([-28.3, -23.5, 128.0])
+_REST_DEPTH_MM = 134.0  # of the middle of the LEDs' box
 _REST_RVEC_RAD = np.array([-0.0227, 0.0140, -0.0122])
 _GRAVITY_CAMERA_MPS2 = matrix_from_rvec(np.array([0.0364, 0.0, 0.0279])) @ np.array([0.0, 9.80665, 0.0])
 _STEP_S = 1e-5
+CARD_SLIDE_S = 0.06
 
 Epoch = Synchronized  # of an int64: the first edge, ns; 0 until the unit is armed
 
 
 def make_epoch() -> "Epoch[int]":
-    """Return the shared instant of the first edge, not yet set; it passes to a spawned process as an argument."""
+    """Return the shared instant of the first edge, not yet set; a spawned process takes it as an argument."""
     epoch: Epoch[int] = multiprocessing.get_context("spawn").Value("q", 0)
     return epoch
 
@@ -56,6 +58,19 @@ class SimWorld:
         self._epoch = epoch
         self._motion = make_motion(settings)
         self._R_rest = matrix_from_rvec(_REST_RVEC_RAD)
+        middle_mm = 0.5 * (self.brick.led_positions_mm.max(axis=0) + self.brick.led_positions_mm.min(axis=0))
+        self._t_rest_mm = np.array([0.0, 0.0, _REST_DEPTH_MM]) - self._R_rest @ middle_mm
+        unknown = {h.name for h in settings.hidden_leds} - set(self.brick.led_names)
+        if unknown:
+            raise ConfigError(
+                f"sim.hidden_leds: name: no LED {min(unknown)!r} in this layout; "
+                f"expected one of: {', '.join(self.brick.led_names)}"
+            )
+
+    @property
+    def rest_pose(self) -> tuple[FloatArray, FloatArray]:
+        """``R_camera_brick`` (3, 3) and ``t_camera_brick_mm`` (3,) before the shake."""
+        return self._R_rest.copy(), self._t_rest_mm.copy()
 
     @property
     def first_edge_ns(self) -> int | None:
@@ -82,7 +97,7 @@ class SimWorld:
     def pose(self, t_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return ``R_camera_brick`` (n, 3, 3) and ``t_camera_brick_mm`` (n, 3) at instants (n,)."""
         q, _, _ = self._coordinates(self.since_first_edge_s(t_ns))
-        return self._R_rest @ matrix_from_rvec(q[:, 3:]), _REST_T_MM + q[:, :3]
+        return self._R_rest @ matrix_from_rvec(q[:, 3:]), self._t_rest_mm + q[:, :3]
 
     def twist(self, t_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the angular rate in brick axes, rad/s, and the origin's velocity in camera axes, mm/s."""
@@ -103,18 +118,26 @@ class SimWorld:
         R_brick_imu = np.eye(3) if self.brick.R_brick_imu is None else self.brick.R_brick_imu
         return Inertial(force_brick @ R_brick_imu, omega @ R_brick_imu)
 
-    def view_is_covered(self, t_ns: IntArray) -> BoolArray:
-        """Tell when the opaque card hides everything."""
-        s = self.since_first_edge_s(t_ns)
-        covered = np.zeros(np.shape(s), dtype=np.bool_)
-        for start, duration in self.settings.dropouts:
-            covered |= (s >= start) & (s < start + duration)
-        return covered
+    def card_cover(self, t_ns: IntArray) -> FloatArray:
+        """Return how far the opaque card has slid before the lens: 0 away, 1 hides everything.
 
-    def hidden_leds(self, t_ns: int) -> set[str]:
-        """Return the names of LEDs that something stands before."""
-        s = float(self.since_first_edge_s(np.array([t_ns]))[0])
-        return {h.name for h in self.settings.hidden_leds if h.start_s <= s < h.start_s + h.duration_s}
+        It hides everything from a dropout's start to its end, and slides in and out in `CARD_SLIDE_S`
+        around it.
+        """
+        s = self.since_first_edge_s(t_ns)
+        cover = np.zeros(np.shape(s))
+        for start, duration in self.settings.dropouts:
+            beyond = np.maximum(start - s, s - (start + duration))
+            cover = np.maximum(cover, np.clip(1 - beyond / CARD_SLIDE_S, 0, 1))
+        return np.asarray(cover)
+
+    def leds_hidden(self, t_ns: IntArray) -> BoolArray:
+        """Tell for instants (n,) and each LED, shape (n, n_leds), whether something stands before it."""
+        s = self.since_first_edge_s(t_ns)
+        hidden = np.zeros((len(s), self.brick.n_leds), dtype=np.bool_)
+        for h in self.settings.hidden_leds:
+            hidden[:, self.brick.led_names.index(h.name)] |= (s >= h.start_s) & (s < h.start_s + h.duration_s)
+        return hidden
 
     def edge_times_ns(self, first: int, last: int) -> IntArray:
         """Return the true instants of the rising edges ``first`` to ``last`` - 1 on the unit's clock."""
