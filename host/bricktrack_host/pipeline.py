@@ -47,7 +47,7 @@ logger = logging.getLogger(__name__)
 RESULTS_FOLDER = "results"
 REPORT_NAME = "report.html"
 _N_OVERLAYS = 4
-_RETIME_PASSES = 2
+_RETIME_PASSES = 1
 
 
 class ProcessSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -179,11 +179,7 @@ def process_run(
             form=settings.prsoi_form,
             rolling_shutter=settings.rolling_shutter,
         )
-    if not np.isfinite(optical.t_camera_brick_mm).all(axis=1).any():
-        raise TrackingError(
-            f"{folder.name}: none of {frames.n_frames} frames gave a pose. Look at a picture of the run: are "
-            f"at least 5 of the {brick.n_leds} LEDs lit, sharp and inside it, and is this their layout?"
-        )
+    _require_poses(optical, run, brick)
     with stages("align clocks"):
         edge_fit = _fit_square_wave(run, problems)
         imu = _choose_imu(run, brick, settings, problems)
@@ -192,6 +188,7 @@ def process_run(
     with stages("fuse"):
         if settings.rolling_shutter:
             optical = _retime(observations, optical, imu, alignment, rays.ray_model, brick)
+            _require_poses(optical, run, brick)
         grid = _output_grid(optical, imu, alignment, edge_fit)
         fused, fusion = _fuse(optical, imu, alignment, brick, grid, problems)
     result = RunResult(
@@ -274,6 +271,14 @@ class _Pictures:
             seconds = (optical.t_ns[i] - optical.t_ns[0]) / 1e9
             out.append(FrameOverlay(f"frame {i}, {seconds:.2f} s", luma, observations.uv_px[i], predicted))
         return out
+
+
+def _require_poses(optical: OpticalTrack, run: Run, brick: BrickModel) -> None:
+    if not np.isfinite(optical.t_camera_brick_mm).all(axis=1).any():
+        raise TrackingError(
+            f"{run.folder.name}: none of {len(optical.t_ns)} frames gave a pose. Look at a picture of the run: "
+            f"are at least 5 of the {brick.n_leds} LEDs lit, sharp and inside it, and is this their layout?"
+        )
 
 
 def _fit_square_wave(run: Run, problems: list[str]) -> EdgeFit | None:
@@ -401,6 +406,8 @@ def _retime(
             return optical  # the fusion itself will say why
         motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)))
         optical = solve_poses(observations, rays, brick, motion=motion)
+        if not np.isfinite(optical.t_camera_brick_mm).any():
+            break
     return optical
 
 
