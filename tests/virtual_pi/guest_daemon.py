@@ -23,7 +23,7 @@ from bricktrack_common.imu_records import ImuFlag, decode_imu, read_imu
 from bricktrack_common.run_folder import read_edges
 from bricktrack_common.run_manifest import read_manifest
 from bricktrack_device.hardware.smbus_i2c import SmbusI2c
-from bricktrack_host.unit_client import UnitClient
+from bricktrack_host.transfer.unit_client import UnitClient
 
 PORT = 41733
 CONFIG = """

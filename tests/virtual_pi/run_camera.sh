@@ -32,4 +32,4 @@ sources=/opt/bricktrack:$repository/common:$repository/device:$repository/host:$
 exec "$vpi/vpi" --root "$root" --mem 1536 --timeout 500 --share "$repository" -- \
     /usr/bin/env "PYTHONPATH=$sources" PYTHONDONTWRITEBYTECODE=1 "LIBCAMERA_LOG_LEVELS=*:ERROR" \
     /opt/venv/bin/python -m pytest -q -p no:cacheprovider -W ignore::DeprecationWarning \
-    --rootdir "$here" -c /dev/null "$@" "$here/guest_camera.py" "$here/guest_unit.py"
+    --rootdir "$here" -c /dev/null "$@" "$here/guest_unit.py" "$here/guest_camera.py"
