@@ -29,12 +29,14 @@ check: $(READY)  ## formatting, lint, import contracts, types, documentation
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+	@rm -rf docs/reference/generated
 	$(BIN)/sphinx-build -q -W -b html docs docs/_build/html
 
 bench: $(READY)  ## measure speed and accuracy; ratios are taken side by side in one run
 	$(BIN)/python scripts/bench.py
 
 docs: $(READY)  ## build the documentation into docs/_build/html
+	@rm -rf docs/reference/generated
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html
 
 format: $(READY)  ## put the code into its form

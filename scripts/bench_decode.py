@@ -14,7 +14,7 @@ from pathlib import Path
 import av
 
 from bricktrack_common.run_folder import read_run
-from bricktrack_host.video_frames import decode_run_video
+from bricktrack_host.recordings.video_frames import decode_run_video
 
 
 def bare_decode(video: Path, threads: int) -> int:

@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.fusion import fuse
+from bricktrack_host.fusion.estimate import fuse
+from bricktrack_host.fusion.time_alignment import align_times
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.time_alignment import align_times
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
 LEVER_ARM_MM = (26.045, 53.000, 14.199)

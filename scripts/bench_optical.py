@@ -21,10 +21,10 @@ import numpy as np
 from bricktrack_common.brick_model import BrickModel, ProfileEntry, load_brick_model
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_quaternion, rvec_from_matrix
-from bricktrack_host.calibration_file import load_calibration
-from bricktrack_host.led_fit import fit_collar
-from bricktrack_host.optical_track import observe_leds, solve_poses
-from bricktrack_host.segment import Picture, find_blobs, paper_filter
+from bricktrack_host.calibration.calibration_file import load_calibration
+from bricktrack_host.tracking.led_fit import fit_collar
+from bricktrack_host.tracking.optical_track import observe_leds, solve_poses
+from bricktrack_host.tracking.segment import Picture, find_blobs, paper_filter
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
 FIRST_STAMP_NS = {"static": 4823310455208, "motion": 5118442907613}  # rig.toml

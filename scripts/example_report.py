@@ -23,15 +23,15 @@ from bricktrack_common.run_manifest import (
     RunManifest,
     TriggerSection,
 )
-from bricktrack_host.daq_clock import fit_edges
-from bricktrack_host.plots import CalibrationPicture, FrameOverlay
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.report import ReportExtras, write_report
-from bricktrack_host.rest_pose import tare
-from bricktrack_host.results import Provenance, RunResult, write_results
+from bricktrack_host.reporting.plots import CalibrationPicture, FrameOverlay
+from bricktrack_host.reporting.report import ReportExtras, write_report
+from bricktrack_host.results.daq_clock import fit_edges
+from bricktrack_host.results.rest_pose import tare
+from bricktrack_host.results.result_store import Provenance, RunResult, write_results
+from bricktrack_host.results.true_motion import TrueMotion
+from bricktrack_host.results.truth import compare_with_truth
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
-from bricktrack_host.true_motion import TrueMotion
-from bricktrack_host.truth import compare_with_truth
 
 LED_NAMES = ("m0", "m1", "m2", "m3", "m4", "m5", "m6")
 LEDS_MM = np.array(

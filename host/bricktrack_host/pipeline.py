@@ -24,23 +24,34 @@ from bricktrack_common.frame_times import FrameTimes
 from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2, ImuDescription, ImuSamples
 from bricktrack_common.run_folder import Run, read_run
 from bricktrack_common.run_manifest import MANIFEST_NAME, TRUTH_NAME
-from bricktrack_host.calibration_file import Calibration, CentralRaysRecord, load_calibration, require_match
-from bricktrack_host.daq_clock import EdgeFit, EdgeFitError, fit_edges
-from bricktrack_host.fusion import FusionResult, fuse
-from bricktrack_host.optical_smoothing import smooth_optical
-from bricktrack_host.optical_track import led_motion, observe_leds, solve_poses
-from bricktrack_host.plots import CalibrationPicture, FrameOverlay
-from bricktrack_host.report import ReportExtras, write_report
-from bricktrack_host.report_pictures import PICTURES_NAME, save_pictures
-from bricktrack_host.rest_pose import RestPose, tare
-from bricktrack_host.result_tables import FusedKind
-from bricktrack_host.results import Details, Provenance, RunResult, software_version, write_results
-from bricktrack_host.segment import Picture, Plane
-from bricktrack_host.time_alignment import TimeAlignment, align_times
+from bricktrack_host.calibration.calibration_file import (
+    Calibration,
+    CentralRaysRecord,
+    load_calibration,
+    require_match,
+)
+from bricktrack_host.fusion.estimate import FusionResult, fuse
+from bricktrack_host.fusion.optical_smoothing import smooth_optical
+from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
+from bricktrack_host.recordings.video_frames import decode_run_video
+from bricktrack_host.reporting.plots import CalibrationPicture, FrameOverlay
+from bricktrack_host.reporting.report import ReportExtras, write_report
+from bricktrack_host.reporting.report_pictures import PICTURES_NAME, save_pictures
+from bricktrack_host.results.daq_clock import EdgeFit, EdgeFitError, fit_edges
+from bricktrack_host.results.rest_pose import RestPose, tare
+from bricktrack_host.results.result_store import (
+    Details,
+    Provenance,
+    RunResult,
+    software_version,
+    write_results,
+)
+from bricktrack_host.results.result_tables import FusedKind
+from bricktrack_host.results.true_motion import read_true_motion
+from bricktrack_host.results.truth import TruthComparison, compare_with_truth
+from bricktrack_host.tracking.optical_track import led_motion, observe_leds, solve_poses
+from bricktrack_host.tracking.segment import Picture, Plane
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
-from bricktrack_host.true_motion import read_true_motion
-from bricktrack_host.truth import TruthComparison, compare_with_truth
-from bricktrack_host.video_frames import decode_run_video
 
 logger = logging.getLogger(__name__)
 
@@ -276,7 +287,7 @@ class _Pictures:
 def _require_poses(optical: OpticalTrack, run: Run, brick: BrickModel) -> None:
     if not np.isfinite(optical.t_camera_brick_mm).all(axis=1).any():
         raise TrackingError(
-            f"{run.folder.name}: none of {len(optical.t_ns)} frames gave a pose. Look at a picture of the run: "
+            f"{run.folder.name}: none of {len(optical.t_ns)} frames gave a pose. Look at a picture: "
             f"are at least 5 of the {brick.n_leds} LEDs lit, sharp and inside it, and is this their layout?"
         )
 

@@ -13,12 +13,12 @@ import pytest
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError, ConfigError, RunFormatError, TrackingError, VideoError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest, write_manifest
-from bricktrack_host.calibration_file import load_calibration, save_calibration
+from bricktrack_host.calibration.calibration_file import load_calibration, save_calibration
 from bricktrack_host.cli import calibrate
-from bricktrack_host.import_recording import Recording, import_recording
-from bricktrack_host.loose_files import read_rig
 from bricktrack_host.pipeline import ProcessSettings, process_run
 from bricktrack_host.quality import PoseFlag
+from bricktrack_host.recordings.import_recording import Recording, import_recording
+from bricktrack_host.recordings.loose_files import read_rig
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data" / "path-traced"
 LAYOUT = SAMPLE / "layout.toml"

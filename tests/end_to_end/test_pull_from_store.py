@@ -19,9 +19,9 @@ from bricktrack_common.wire_messages import (
 from bricktrack_device.file_server import FileServer
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.run_store import RunStore
-from bricktrack_host.fleet_config import UnitConfig
-from bricktrack_host.pull import pull_unit
-from bricktrack_host.unit_client import UnitClient
+from bricktrack_host.transfer.fleet_config import UnitConfig
+from bricktrack_host.transfer.pull import pull_unit
+from bricktrack_host.transfer.unit_client import UnitClient
 
 RUN = "b1_9f31c2_0001_shake"
 

@@ -23,11 +23,11 @@ from bricktrack_common.wire_messages import (
     RunDescription,
     encode_message,
 )
-from bricktrack_host import part_folder
-from bricktrack_host.fleet_config import UnitConfig, unit_at
-from bricktrack_host.part_folder import JOURNAL_NAME
-from bricktrack_host.pull import pull_fleet, pull_run, pull_unit
-from bricktrack_host.unit_client import UnitClient
+from bricktrack_host.transfer import part_folder
+from bricktrack_host.transfer.fleet_config import UnitConfig, unit_at
+from bricktrack_host.transfer.part_folder import JOURNAL_NAME
+from bricktrack_host.transfer.pull import pull_fleet, pull_run, pull_unit
+from bricktrack_host.transfer.unit_client import UnitClient
 
 RUN = "fake_9f31_0001_shake"
 MIB = 1024 * 1024
@@ -347,7 +347,7 @@ def test_the_systems_own_refusal_to_write_is_a_storage_error(source, here):
 def test_too_little_room_is_said_before_anything_is_fetched(source, here, monkeypatch):
     usage = part_folder.os.statvfs(here)
     monkeypatch.setattr(
-        "bricktrack_host.pull.shutil.disk_usage",
+        "bricktrack_host.transfer.pull.shutil.disk_usage",
         lambda path: type("U", (), {"free": MIB, "total": usage.f_blocks}),
     )
     with FakeUnit(source.parent) as unit:

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from bricktrack_common.errors import BricktrackError
 from bricktrack_common.imu_records import decode_imu
-from bricktrack_host.annex_b import split_access_units
-from bricktrack_host.fleet_config import check_address
-from bricktrack_host.h264_headers import PictureOrder
-from bricktrack_host.imu_import import import_imu
-from bricktrack_host.loose_files import LooseImu, read_edges_csv, read_imu_csv, read_timestamps
+from bricktrack_host.recordings.annex_b import split_access_units
+from bricktrack_host.recordings.h264_headers import PictureOrder
+from bricktrack_host.recordings.imu_import import import_imu
+from bricktrack_host.recordings.loose_files import LooseImu, read_edges_csv, read_imu_csv, read_timestamps
+from bricktrack_host.transfer.fleet_config import check_address
 
 NAL_LIKE = st.lists(
     st.one_of(

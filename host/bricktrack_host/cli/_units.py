@@ -10,9 +10,9 @@ from typing import Annotated, TypeVar
 import typer
 
 from bricktrack_common.errors import BricktrackError, ConfigError
-from bricktrack_host.fleet_config import Fleet, UnitConfig, check_name, load_fleet, unit_at
-from bricktrack_host.pull import MAX_WORKERS
-from bricktrack_host.unit_client import UnitClient
+from bricktrack_host.transfer.fleet_config import Fleet, UnitConfig, check_name, load_fleet, unit_at
+from bricktrack_host.transfer.pull import MAX_WORKERS
+from bricktrack_host.transfer.unit_client import UnitClient
 
 T = TypeVar("T")
 

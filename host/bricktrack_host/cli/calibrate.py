@@ -14,10 +14,15 @@ from rich.table import Table
 from bricktrack_common.camera_model import IMX219_1080P, SensorMode
 from bricktrack_common.errors import CalibrationError, ConfigError
 from bricktrack_common.typed_data import load_toml
-from bricktrack_host.calibration_file import Target, TargetImage, make_calibration, save_calibration
-from bricktrack_host.dot_detection import GreyImage, detect_dots
-from bricktrack_host.dot_grid import GridOrigin, assign_grid
-from bricktrack_host.ray_calibration import ModelWish, RayCalibration, calibrate_rays
+from bricktrack_host.calibration.calibration_file import (
+    Target,
+    TargetImage,
+    make_calibration,
+    save_calibration,
+)
+from bricktrack_host.calibration.dot_detection import GreyImage, detect_dots
+from bricktrack_host.calibration.dot_grid import GridOrigin, assign_grid
+from bricktrack_host.calibration.ray_calibration import ModelWish, RayCalibration, calibrate_rays
 
 app = typer.Typer(help="Calibrate cameras from pictures of dot targets.", no_args_is_help=True)
 

@@ -23,9 +23,9 @@ from bricktrack_common.wire_messages import StatusReply
 from bricktrack_host.cli import calibrate
 from bricktrack_host.cli._console import err, out
 from bricktrack_host.cli.process import say_processed, stage_bar
-from bricktrack_host.fleet_config import load_fleet
 from bricktrack_host.pipeline import process_run
-from bricktrack_host.unit_client import UnitClient
+from bricktrack_host.transfer.fleet_config import load_fleet
+from bricktrack_host.transfer.unit_client import UnitClient
 
 UNIT = "demo-brick"
 _START_S = 30.0  # the simulated sensor's reset and a cold encoder take a second each; slow machines some more

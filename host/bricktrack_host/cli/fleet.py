@@ -20,7 +20,7 @@ from bricktrack_host.cli._units import (
     ask_units,
     choose_units,
 )
-from bricktrack_host.fleet_config import UnitConfig
+from bricktrack_host.transfer.fleet_config import UnitConfig
 
 _STATE_STYLES = {
     "idle": "green",

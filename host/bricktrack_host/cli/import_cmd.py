@@ -11,7 +11,7 @@ from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.typed_data import load_toml
 from bricktrack_host.cli._console import err, out
-from bricktrack_host.loose_files import LooseRig, read_rig, sensor_mode
+from bricktrack_host.recordings.loose_files import LooseRig, read_rig, sensor_mode
 
 _RIG = "How the sensor was read"
 _IMU = "Inertial samples"
@@ -152,8 +152,8 @@ def import_recording(
 
         bricktrack import --video s.h264 --timestamps s.txt --exposure-us 4000 --line-time-us 18.9035 --first-sensor-timestamp-ns 0 --width 1920 --height 1080 --unit b1 --label s --real
     """  # noqa: E501
-    from bricktrack_host.import_recording import Recording
-    from bricktrack_host.import_recording import import_recording as make_run
+    from bricktrack_host.recordings.import_recording import Recording
+    from bricktrack_host.recordings.import_recording import import_recording as make_run
 
     explicit = {
         "--exposure-us": exposure_us,

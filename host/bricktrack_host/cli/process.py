@@ -14,7 +14,6 @@ from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.cli._console import err, out, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
 from bricktrack_host.cli._units import DEFAULT_FLEET, FleetOption
-from bricktrack_host.fleet_config import UnitConfig, load_fleet
 from bricktrack_host.pipeline import (
     REPORT_NAME,
     RESULTS_FOLDER,
@@ -23,13 +22,14 @@ from bricktrack_host.pipeline import (
     find_truth,
     process_run,
 )
-from bricktrack_host.pull import PulledRun
-from bricktrack_host.report import ReportExtras, write_report
-from bricktrack_host.report_pictures import PICTURES_NAME, load_pictures
-from bricktrack_host.results import read_result
-from bricktrack_host.run_summary import key_figures, verdict
-from bricktrack_host.true_motion import read_true_motion
-from bricktrack_host.truth import TruthComparison, compare_with_truth, comparison_table
+from bricktrack_host.reporting.report import ReportExtras, write_report
+from bricktrack_host.reporting.report_pictures import PICTURES_NAME, load_pictures
+from bricktrack_host.results.result_store import read_result
+from bricktrack_host.results.run_summary import key_figures, verdict
+from bricktrack_host.results.true_motion import read_true_motion
+from bricktrack_host.results.truth import TruthComparison, compare_with_truth, comparison_table
+from bricktrack_host.transfer.fleet_config import UnitConfig, load_fleet
+from bricktrack_host.transfer.pull import PulledRun
 
 CalibrationOption = Annotated[
     Path | None,

@@ -19,8 +19,8 @@ from bricktrack_common.errors import BricktrackError
 from bricktrack_host.cli._console import err, out, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
 from bricktrack_host.cli._units import AddressOption, FleetOption, TimeoutOption, UnitOption, choose_units
-from bricktrack_host.fleet_config import UnitConfig
-from bricktrack_host.pull import MAX_WORKERS, PulledRun, UnitPull, pull_fleet
+from bricktrack_host.transfer.fleet_config import UnitConfig
+from bricktrack_host.transfer.pull import MAX_WORKERS, PulledRun, UnitPull, pull_fleet
 
 ProcessHook = Callable[[UnitConfig, PulledRun], None]
 """Processes one pulled run with its unit's calibration and layout; raises `BricktrackError`."""

@@ -7,7 +7,7 @@ import pytest
 from small_videos import write_video
 
 from bricktrack_common.errors import VideoError
-from bricktrack_host.annex_b import AccessUnit, split_access_units
+from bricktrack_host.recordings.annex_b import AccessUnit, split_access_units
 
 SPS, PPS, SEI, AUD = b"\x67sps", b"\x68pps", b"\x06sei", b"\x09\x10"
 IDR, P = b"\x65\x88data", b"\x41\x9adata"  # first bit after the header is 1: first_mb_in_slice == 0

@@ -9,7 +9,7 @@ import pytest
 
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration_file import (
+from bricktrack_host.calibration.calibration_file import (
     Target,
     TargetImage,
     load_calibration,
@@ -17,8 +17,8 @@ from bricktrack_host.calibration_file import (
     require_match,
     save_calibration,
 )
-from bricktrack_host.dot_observations import DotObservations
-from bricktrack_host.ray_calibration import calibrate_rays
+from bricktrack_host.calibration.dot_observations import DotObservations
+from bricktrack_host.calibration.ray_calibration import calibrate_rays
 
 PLANES_MM = (101.117, 161.111)
 

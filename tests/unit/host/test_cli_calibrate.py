@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import BricktrackError, CalibrationError, ConfigError
-from bricktrack_host.calibration_file import load_calibration
+from bricktrack_host.calibration.calibration_file import load_calibration
 from bricktrack_host.cli.calibrate import app
 
 SAMPLE = Path(__file__).resolve().parents[2] / "data" / "path-traced"

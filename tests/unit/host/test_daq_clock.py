@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bricktrack_common.errors import ShapeError
-from bricktrack_host.daq_clock import EdgeFitError, fit_edges
+from bricktrack_host.results.daq_clock import EdgeFitError, fit_edges
 
 START_NS = 5_118_514_105_508  # some hours of uptime: too large for float seconds
 

@@ -4,7 +4,7 @@ import pytest
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.wire_messages import HelloReply
-from bricktrack_host.fleet_config import check_name, load_fleet, unit_at
+from bricktrack_host.transfer.fleet_config import check_name, load_fleet, unit_at
 
 GOOD = """
 runs_folder = "data/runs"

@@ -4,8 +4,8 @@ import pytest
 from small_videos import write_video
 
 from bricktrack_common.errors import VideoError
-from bricktrack_host.annex_b import NAL_SPS, iter_nal_units, split_access_units
-from bricktrack_host.h264_headers import PictureOrder, _Bits, parse_sequence_parameters
+from bricktrack_host.recordings.annex_b import NAL_SPS, iter_nal_units, split_access_units
+from bricktrack_host.recordings.h264_headers import PictureOrder, _Bits, parse_sequence_parameters
 
 
 def units_of(path):

@@ -12,10 +12,10 @@ from bricktrack_common.errors import ConfigError, RunFormatError, StorageError, 
 from bricktrack_common.frame_times import FrameFlag
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.run_folder import read_run
-from bricktrack_host.import_recording import Recording, import_recording
-from bricktrack_host.imu_import import import_imu
-from bricktrack_host.loose_files import LooseImu, LooseRig, read_rig, sensor_mode
-from bricktrack_host.video_frames import decode_run_video
+from bricktrack_host.recordings.import_recording import Recording, import_recording
+from bricktrack_host.recordings.imu_import import import_imu
+from bricktrack_host.recordings.loose_files import LooseImu, LooseRig, read_rig, sensor_mode
+from bricktrack_host.recordings.video_frames import decode_run_video
 
 N = 24
 T0_NS = 5_118_442_907_613
@@ -265,7 +265,7 @@ def test_nothing_is_left_behind_by_a_failure(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("bricktrack_host.import_recording.write_manifest", full)
+    monkeypatch.setattr("bricktrack_host.recordings.import_recording.write_manifest", full)
     with pytest.raises(StorageError, match="no space left"):
         imported(tmp_path)
     assert list((tmp_path / "runs").iterdir()) == []

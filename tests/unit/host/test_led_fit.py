@@ -4,7 +4,7 @@ from led_scenes import leds_in_camera, lit_outline, polygon_centroid, random_pos
 from pinhole import PinholeCamera
 
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.led_fit import fit_collar
+from bricktrack_host.tracking.led_fit import fit_collar
 from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()

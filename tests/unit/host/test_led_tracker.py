@@ -7,9 +7,9 @@ from pinhole import PinholeCamera
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.led_tracker import observe_leds, usual_radius_px
-from bricktrack_host.optical_track import solve_poses
 from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.tracking.led_tracker import observe_leds, usual_radius_px
+from bricktrack_host.tracking.optical_track import solve_poses
 
 CAMERA = PinholeCamera()
 COLLAR = 0.7

@@ -5,7 +5,7 @@ import pytest
 
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import ConfigError, RunFormatError, VideoError
-from bricktrack_host.loose_files import read_edges_csv, read_imu_csv, read_rig, read_timestamps
+from bricktrack_host.recordings.loose_files import read_edges_csv, read_imu_csv, read_rig, read_timestamps
 
 
 @pytest.fixture

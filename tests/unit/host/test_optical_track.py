@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.brick_model import LayoutFile, LedEntry, ProfileEntry, brick_model_from_file
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.led_profile import predict_brick
-from bricktrack_host.optical_track import led_motion, led_times_ns, solve_poses
 from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.optical_track import led_motion, led_times_ns, solve_poses
 from bricktrack_host.tracks import FusedTrack, LedObservations
 
 CAMERA = PinholeCamera()

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import CalibrationError, ShapeError
-from bricktrack_host.central_rays import fit_central_rays
-from bricktrack_host.disc_bias import disc_bias_px, disc_diameter_mm
-from bricktrack_host.dot_observations import DotObservations
-from bricktrack_host.irt import fit_two_plane_irt
-from bricktrack_host.ray_calibration import (
+from bricktrack_host.calibration.central_rays import fit_central_rays
+from bricktrack_host.calibration.disc_bias import disc_bias_px, disc_diameter_mm
+from bricktrack_host.calibration.dot_observations import DotObservations
+from bricktrack_host.calibration.irt import fit_two_plane_irt
+from bricktrack_host.calibration.ray_calibration import (
     calibrate_rays,
     centrality_test,
     choose_model,
@@ -244,7 +244,7 @@ def test_too_little_is_refused_with_words():
 
 def test_left_out_errors_are_those_of_fits_without_the_block(noisy_planes):
     """Against refitting: the closed form must give what leaving dots out gives."""
-    from bricktrack_host import irt
+    from bricktrack_host.calibration import irt
 
     _, dots = noisy_planes[0]
     fold = np.arange(len(dots)) % 5

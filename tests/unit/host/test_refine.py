@@ -5,8 +5,8 @@ from pinhole import PinholeCamera
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.correspondence import prsoi_starts
-from bricktrack_host.refine import LedMotion, refine_poses
+from bricktrack_host.tracking.correspondence import prsoi_starts
+from bricktrack_host.tracking.refine import LedMotion, refine_poses
 
 CAMERA = PinholeCamera()
 SD_PX = 0.06

@@ -11,8 +11,8 @@ from bricktrack_common.clocks import ClockTriplet
 from bricktrack_common.errors import StorageError
 from bricktrack_common.run_manifest import ClocksSection
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.report import flag_meanings, recording_date, render_report, write_report
-from bricktrack_host.run_summary import key_figures, verdict
+from bricktrack_host.reporting.report import flag_meanings, recording_date, render_report, write_report
+from bricktrack_host.results.run_summary import key_figures, verdict
 
 from .test_results import example
 
@@ -178,7 +178,7 @@ def test_the_same_result_gives_the_same_report(nothing):
 
 
 def test_write_replaces_the_file_whole_and_says_why_it_cannot(result, tmp_path, monkeypatch):
-    monkeypatch.setattr("bricktrack_host.report.render_report", lambda *_: "<html>")
+    monkeypatch.setattr("bricktrack_host.reporting.report.render_report", lambda *_: "<html>")
     write_report(result, tmp_path / "report.html")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(StorageError, match="cannot be written"):

@@ -14,10 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import RunFormatError, StorageError, TrackingError
-from bricktrack_host import results as results_module
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.rest_pose import tare
-from bricktrack_host.results import read_result, write_results
+from bricktrack_host.results import result_store as results_module
+from bricktrack_host.results.rest_pose import tare
+from bricktrack_host.results.result_store import read_result, write_results
 from bricktrack_host.tracks import OpticalTrack
 
 ROOT = Path(__file__).parents[3]
@@ -188,7 +188,7 @@ def test_a_kill_while_writing_leaves_the_old_results_whole(folder, tmp_path, res
     write_results(result, target)
     before = {p.name: p.read_bytes() for p in target.iterdir()}
     code = (
-        "import os, sys; from pathlib import Path; from bricktrack_host import results as r;"
+        "import os, sys; from pathlib import Path; from bricktrack_host.results import result_store as r;"
         "done = r.read_result(Path(sys.argv[1]));"
         "r.dump_json = lambda value: os._exit(9);"  # dies after the tables, before the summary
         "r.write_results(done, Path(sys.argv[1]))"

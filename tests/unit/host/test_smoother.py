@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.smoother import (
+from bricktrack_host.fusion.smoother import (
     ATT,
     BA,
     BG,

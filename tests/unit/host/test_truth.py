@@ -12,8 +12,8 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import RunFormatError, TrackingError
-from bricktrack_host.true_motion import read_true_motion
-from bricktrack_host.truth import compare_with_truth, comparison_table
+from bricktrack_host.results.true_motion import read_true_motion
+from bricktrack_host.results.truth import compare_with_truth, comparison_table
 
 from .test_results import example
 

@@ -17,7 +17,7 @@ from bricktrack_common.wire_messages import (
     Refusal,
     encode_message,
 )
-from bricktrack_host.unit_client import Stopped, UnitClient
+from bricktrack_host.transfer.unit_client import Stopped, UnitClient
 
 RUN = "fake_0001_shake"
 

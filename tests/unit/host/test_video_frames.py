@@ -7,9 +7,9 @@ from small_videos import HEIGHT, PERIOD_US, WIDTH, grey_of, write_video
 
 from bricktrack_common.errors import VideoError
 from bricktrack_common.frame_times import FrameTimes
-from bricktrack_host.annex_b import split_access_units
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.video_frames import decode_run_video
+from bricktrack_host.recordings.annex_b import split_access_units
+from bricktrack_host.recordings.video_frames import decode_run_video
 
 N, GOP = 32, 8
 MEAN_TOLERANCE = 3  # grey levels; CRF 18 errs by less than one, neighbours differ by 37

@@ -1,0 +1,1 @@
+"""From pictures of dot targets to rays, with their uncertainty."""

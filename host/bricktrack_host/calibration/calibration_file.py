@@ -1,0 +1,385 @@
+"""The calibration file: a fitted ray model with all that is needed to trust it, as versioned JSON text.
+
+It says which unit and sensor mode it belongs to, from which pictures (with their SHA-256), target and planes
+it was made, how, when and by which version, what the fit left, how well it predicts left-out dots, where
+dots were, and the covariance of its coefficients.
+"""
+
+from datetime import UTC, datetime
+from functools import cached_property
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from bricktrack_common.arrays import FloatArray
+from bricktrack_common.camera_model import SensorMode
+from bricktrack_common.errors import CalibrationError
+from bricktrack_common.typed_data import convert, dump_json, load_json
+from bricktrack_host.calibration.central_rays import CentralRays
+from bricktrack_host.calibration.fit_residuals import PlaneResiduals
+from bricktrack_host.calibration.irt import TwoPlaneIrt
+from bricktrack_host.calibration.picture_region import ConvexRegion
+from bricktrack_host.calibration.pixel_polynomials import n_terms
+from bricktrack_host.calibration.ray_calibration import ModelChoice, RayCalibration
+
+FORMAT = "bricktrack-calibration"
+VERSION = 1
+
+Row = tuple[float, ...]
+Order = Annotated[int, msgspec.Meta(ge=1, le=20)]
+Millimetres = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class CentralRaysRecord(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="model", tag="central"
+):
+    """`bricktrack_host.calibration.central_rays.CentralRays` as stored.
+
+    Attributes
+    ----------
+    order : int
+    slope_coefficients_x, slope_coefficients_y : tuple of float
+        Of s^i t^j by degree i + j, then by j; s and t are u and v scaled to [-1, 1] across the picture.
+    centre_mm : (float, float, float), mm, camera frame
+    covariance_lower : tuple of float
+        Lower triangle, row by row, of the covariance of [x coefficients, x0, y coefficients, y0, z0].
+    covered_px : tuple of (float, float), px
+        Polygon around the dots seen at any plane.
+    """
+
+    order: Order
+    slope_coefficients_x: Row
+    slope_coefficients_y: Row
+    centre_mm: tuple[float, float, float]
+    covariance_lower: Row
+    covered_px: tuple[tuple[float, float], ...]
+
+
+class TwoPlaneRecord(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="model", tag="two-plane"
+):
+    """`bricktrack_host.calibration.irt.TwoPlaneIrt` as stored.
+
+    Attributes
+    ----------
+    order : int
+    C_a_mm, D_a_mm, C_b_mm, D_b_mm : tuple of float, mm
+        The paper's C (x) and D (y) at planes A and B, of s^i t^j by degree i + j, then by j; s and t are u
+        and v scaled to [-1, 1] across the picture.
+    covariance_lower_a, covariance_lower_b : tuple of float, mm^2
+        Lower triangle, row by row, of the covariance of C, and equally of D.
+    covered_a_px, covered_b_px : tuple of (float, float), px
+        Polygons around the dots seen at either plane.
+    """
+
+    order: Order
+    C_a_mm: Row
+    D_a_mm: Row
+    C_b_mm: Row
+    D_b_mm: Row
+    covariance_lower_a: Row
+    covariance_lower_b: Row
+    covered_a_px: tuple[tuple[float, float], ...]
+    covered_b_px: tuple[tuple[float, float], ...]
+
+
+class TargetImage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One target picture: file name, hash, depth of its plane, dots found, and left out as contradicting."""
+
+    name: str
+    sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+    z_mm: Millimetres
+    n_dots_found: int
+    n_dots_left_out: int
+
+
+class Target(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The dot target: its size, pitch and dot diameter (as used for the disc correction)."""
+
+    columns: Annotated[int, msgspec.Meta(ge=2)]
+    rows: Annotated[int, msgspec.Meta(ge=2)]
+    pitch_mm: Millimetres
+    dot_diameter_mm: Millimetres
+
+
+class Calibration(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, dict=True, omit_defaults=False
+):
+    """One camera's calibration.
+
+    Attributes
+    ----------
+    format, version
+        What the file is; readers refuse newer versions.
+    unit : str
+        Name of the brick unit.
+    sensor_mode : SensorMode
+        The only mode that it holds for.
+    focus_note : str
+        How the lens stood; a turned lens needs a new calibration.
+    created_utc : datetime
+    software : str
+        Name and version of what made it.
+    method : str
+        How the dots were measured and the model fitted, in words.
+    simulated : bool
+        Made from simulated pictures.
+    target : Target
+    images : tuple of TargetImage
+    plane_a_mm, plane_b_mm : float, mm
+    choice : ModelChoice
+        The model taken, why, and the cross-validated errors of the candidates.
+    residuals : tuple of PlaneResiduals
+    rays : CentralRaysRecord or TwoPlaneRecord
+    """
+
+    format: str = FORMAT
+    version: int = VERSION
+    unit: Annotated[str, msgspec.Meta(min_length=1)]
+    sensor_mode: SensorMode
+    focus_note: str = ""
+    created_utc: Annotated[datetime, msgspec.Meta(tz=True)]
+    software: str
+    method: str
+    simulated: bool = False
+    target: Target
+    images: tuple[TargetImage, ...]
+    plane_a_mm: Millimetres
+    plane_b_mm: Millimetres
+    choice: ModelChoice
+    residuals: tuple[PlaneResiduals, ...]
+    rays: CentralRaysRecord | TwoPlaneRecord
+
+    @cached_property
+    def ray_model(self) -> CentralRays | TwoPlaneIrt:
+        """The calibrated rays; a `bricktrack_common.camera_model.RayModel`."""
+        r = self.rays
+        m = n_terms(r.order)
+        if isinstance(r, CentralRaysRecord):
+            return CentralRays(
+                sensor_mode=self.sensor_mode,
+                plane_a_mm=self.plane_a_mm,
+                plane_b_mm=self.plane_b_mm,
+                order=r.order,
+                coefficients=_rows(m, r.slope_coefficients_x, r.slope_coefficients_y),
+                centre_mm=np.array(r.centre_mm),
+                covariance=_full(r.covariance_lower, 2 * m + 3),
+                region=_region(r.covered_px),
+                residuals=self.residuals,
+            )
+        return TwoPlaneIrt(
+            sensor_mode=self.sensor_mode,
+            plane_a_mm=self.plane_a_mm,
+            plane_b_mm=self.plane_b_mm,
+            order=r.order,
+            coefficients_a=_rows(m, r.C_a_mm, r.D_a_mm),
+            coefficients_b=_rows(m, r.C_b_mm, r.D_b_mm),
+            covariance_a=_full(r.covariance_lower_a, m),
+            covariance_b=_full(r.covariance_lower_b, m),
+            region_a=_region(r.covered_a_px),
+            region_b=_region(r.covered_b_px),
+            residuals=self.residuals,
+        )
+
+
+def make_calibration(
+    fitted: RayCalibration,
+    *,
+    unit: str,
+    target: Target,
+    images: tuple[TargetImage, ...],
+    focus_note: str = "",
+    simulated: bool = False,
+    created_utc: datetime | None = None,
+) -> Calibration:
+    """Return what is to be saved of a fitted ray model.
+
+    Parameters
+    ----------
+    fitted : RayCalibration
+    unit : str
+    target : Target
+    images : tuple of TargetImage
+    focus_note : str, optional
+    simulated : bool, optional
+    created_utc : datetime, optional
+        With its time zone; now where not given.
+    """
+    model = fitted.model
+    if isinstance(model, CentralRays):
+        rays: CentralRaysRecord | TwoPlaneRecord = CentralRaysRecord(
+            order=model.order,
+            slope_coefficients_x=_tuple(model.coefficients[0]),
+            slope_coefficients_y=_tuple(model.coefficients[1]),
+            centre_mm=(float(model.centre_mm[0]), float(model.centre_mm[1]), float(model.centre_mm[2])),
+            covariance_lower=_lower(model.covariance),
+            covered_px=_corners(model.region),
+        )
+        how = f"central rays, slopes of order {model.order}"
+    else:
+        rays = TwoPlaneRecord(
+            order=model.order,
+            C_a_mm=_tuple(model.coefficients_a[0]),
+            D_a_mm=_tuple(model.coefficients_a[1]),
+            C_b_mm=_tuple(model.coefficients_b[0]),
+            D_b_mm=_tuple(model.coefficients_b[1]),
+            covariance_lower_a=_lower(model.covariance_a),
+            covariance_lower_b=_lower(model.covariance_b),
+            covered_a_px=_corners(model.region_a),
+            covered_b_px=_corners(model.region_b),
+        )
+        how = (
+            f"walking pupil, slopes of order {fitted.choice.order}, stored as two planes"
+            if fitted.choice.model == "walking-pupil"
+            else f"two-plane incident-ray tracking, order {model.order}"
+        )
+    return Calibration(
+        unit=unit,
+        sensor_mode=model.sensor_mode,
+        focus_note=focus_note,
+        created_utc=(created_utc or datetime.now(UTC)).astimezone(UTC),
+        software=f"bricktrack {metadata.version('bricktrack')}",
+        method=f"light-weighted dot centroids, corrected for the discs' distortion; {how}",
+        simulated=simulated,
+        target=target,
+        images=images,
+        plane_a_mm=model.plane_a_mm,
+        plane_b_mm=model.plane_b_mm,
+        choice=fitted.choice,
+        residuals=model.residuals,
+        rays=rays,
+    )
+
+
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Write a calibration as JSON text.
+
+    Raises
+    ------
+    CalibrationError
+        If the file cannot be written.
+    """
+    try:
+        path.write_bytes(dump_json(calibration))
+    except OSError as e:
+        raise CalibrationError(f"{path}: {e.strerror or e}") from e
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read a calibration.
+
+    Raises
+    ------
+    CalibrationError
+        If the file is missing, is not a calibration, is of a newer version, or contradicts itself.
+    """
+    data = load_json(path, dict[str, Any], error=CalibrationError)
+    if data.get("format") != FORMAT:
+        raise CalibrationError(
+            f"{path}: format is {data.get('format')!r}; expected {FORMAT!r}, a file that "
+            "'bricktrack calibrate fit' wrote"
+        )
+    version = data.get("version")
+    if not isinstance(version, int) or version < 1:
+        raise CalibrationError(f"{path}: version is {version!r}; expected a whole number from 1 to {VERSION}")
+    if version > VERSION:
+        raise CalibrationError(
+            f"{path}: calibration version {version} is newer than {VERSION}, the newest that this bricktrack "
+            f"{metadata.version('bricktrack')} reads; update bricktrack, or calibrate again with this one"
+        )
+    calibration = convert(data, Calibration, where=str(path), error=CalibrationError)
+    try:
+        _check_rays(calibration)
+    except CalibrationError as e:
+        raise CalibrationError(f"{path}: {e}") from e
+    return calibration
+
+
+def _check_rays(calibration: Calibration) -> None:
+    """Refuse rays that do not open towards the far plane, or do not lead back to their pixels."""
+    a_mm, b_mm = calibration.plane_a_mm, calibration.plane_b_mm
+    if not 0 < a_mm < b_mm:
+        raise CalibrationError(f"planes at {a_mm:g} and {b_mm:g} mm: expected 0 < a < b")
+    model = calibration.ray_model
+    middle = np.array([calibration.sensor_mode.width - 1, calibration.sensor_mode.height - 1]) / 2
+    uv = middle + middle / 4 * np.array([[-1.0, -1.0], [1.0, 1.0]])
+    at_a, at_b = model.points_on_plane(uv, a_mm), model.points_on_plane(uv, b_mm)
+    # u grows along x and v along y, at either plane, and more so farther away.
+    opens = np.all((at_a[1] - at_a[0] > 0) & (at_b[1] - at_b[0] > at_a[1] - at_a[0]))
+    if not opens or not np.allclose(
+        model.project(np.column_stack([at_b, [b_mm, b_mm]])).uv_px, uv, rtol=0, atol=1e-6
+    ):
+        raise CalibrationError("the rays do not lead back to their pixels: the coefficients are damaged")
+
+
+def require_match(calibration: Calibration, *, unit: str | None, sensor_mode: SensorMode) -> None:
+    """Refuse a calibration that belongs to another unit or sensor mode.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    unit : str or None
+        The unit that recorded; None where it is not known.
+    sensor_mode : SensorMode
+        The mode that it recorded in.
+
+    Raises
+    ------
+    CalibrationError
+        Naming both units, or both modes.
+    """
+    if unit is not None and unit != calibration.unit:
+        raise CalibrationError(
+            f"the calibration is of unit {calibration.unit!r}, the recording of unit {unit!r}; every camera "
+            "needs its own calibration"
+        )
+    if not calibration.sensor_mode.matches(sensor_mode):
+        raise CalibrationError(
+            f"the calibration is for sensor mode {_describe(calibration.sensor_mode)}, the recording was "
+            f"made in {_describe(sensor_mode)}; calibrate in the mode that is recorded"
+        )
+
+
+def _describe(mode: SensorMode) -> str:
+    return (
+        f"{mode.name!r} ({mode.width} x {mode.height}, crop {mode.crop_width} x {mode.crop_height} at "
+        f"({mode.crop_x}, {mode.crop_y}), binning {mode.binning}, rows {mode.row_order})"
+    )
+
+
+def _tuple(values: FloatArray) -> Row:
+    return tuple(float(x) for x in values)
+
+
+def _lower(matrix: FloatArray) -> Row:
+    return _tuple(matrix[np.tril_indices(len(matrix))])
+
+
+def _corners(region: ConvexRegion) -> tuple[tuple[float, float], ...]:
+    return tuple((float(u), float(v)) for u, v in region.vertices_px)
+
+
+def _full(lower: Row, n: int) -> FloatArray:
+    if len(lower) != n * (n + 1) // 2:
+        raise CalibrationError(
+            f"a covariance of {len(lower)} numbers; expected {n * (n + 1) // 2} for {n} coefficients"
+        )
+    matrix = np.zeros((n, n))
+    matrix[np.tril_indices(n)] = lower
+    return matrix + np.tril(matrix, -1).T
+
+
+def _rows(n: int, *rows: Row) -> FloatArray:
+    for row in rows:
+        if len(row) != n:
+            raise CalibrationError(f"{len(row)} coefficients; expected {n} for the order given")
+    return np.array(rows, dtype=np.float64)
+
+
+def _region(corners: tuple[tuple[float, float], ...]) -> ConvexRegion:
+    if len(corners) < 3:
+        raise CalibrationError(f"a covered region of {len(corners)} corners; expected three or more")
+    return ConvexRegion(np.array(corners, dtype=np.float64))

@@ -1,0 +1,1 @@
+"""Camera and IMU together: one time base, one smooth motion."""

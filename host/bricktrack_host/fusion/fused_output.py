@@ -1,0 +1,167 @@
+"""The smoothed motion at any instants between the filter's nodes: pose, twist, covariance, flags."""
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, Run
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.smoother import (
+    BA,
+    BG,
+    GRAV,
+    LAG,
+    POS,
+    SKEW,
+    TAU,
+    VEL,
+    Estimate,
+    Problem,
+    State,
+    observe,
+)
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.tracks import FusedTrack
+
+
+def sample_motion(
+    run: Run,
+    nodes: Nodes,
+    lin: Linearisation,
+    problem: Problem,
+    estimate: Estimate,
+    b: int,
+    *,
+    output_t_ns: IntArray,
+    used: BoolArray,
+    settings: FusionSettings,
+    is_smoothed: bool,
+) -> FusedTrack:
+    """Return the motion of run ``b`` of a batch at instants of camera time.
+
+    From the node before, the inertial samples carry the state to the instant, so what happened between nodes
+    is kept. Where that path misses the node after (it does where the samples are not believed), the miss is
+    spread as white noise would: attitude linearly, velocity and position along the cubic between both ends.
+    A filter's state (``is_smoothed`` false) knows nothing of the node after and is only carried on.
+    """
+    n = len(nodes.t_s)
+    t_cam = seconds_since(output_t_ns, run.signal.epoch_ns)
+    x0 = estimate.state.x[0, b]
+    tau, rate = float(x0[TAU]), float(x0[SKEW])
+    t = t_cam + tau + rate * (t_cam - run.t_mid_s)
+    slack = 1e-6
+    outside = (t < nodes.t_s[0] - slack) | (t > nodes.t_s[-1] + slack)
+    t = np.clip(t, nodes.t_s[0], nodes.t_s[-1])
+    k = np.clip(np.searchsorted(nodes.t_s, t, side="right") - 1, 0, n - 2)
+    x, R = estimate.state.x[k, b], estimate.state.R[k, b]
+    dt = t - nodes.t_s[k]
+    part = run.signal.increments(
+        nodes.t_s[k], t, gyro_bias_radps=x[:, BG], acc_bias_mps2=x[:, BA], acc_lag_s=float(x0[LAG])
+    )
+    h = dt[:, None]
+    R_t = R @ part.R
+    v = x[:, VEL] + h * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dv_mps)
+    p = x[:, POS] + h * x[:, VEL] + 0.5 * h**2 * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dp_m)
+    cov = estimate.covariance[k, b]
+    if is_smoothed:
+        span = nodes.t_s[k + 1] - nodes.t_s[k]
+        whole = run.signal.increments(
+            nodes.t_s[k],
+            nodes.t_s[k + 1],
+            gyro_bias_radps=x[:, BG],
+            acc_bias_mps2=x[:, BA],
+            acc_lag_s=float(x0[LAG]),
+        )
+        s, a = span[:, None], (dt / span)[:, None]
+        after_x, after_R = estimate.state.x[k + 1, b], estimate.state.R[k + 1, b]
+        miss_turn = rvec_from_matrix(np.swapaxes(R @ whole.R, 1, 2) @ after_R)
+        miss_v = after_x[:, VEL] - (x[:, VEL] + s * x[:, GRAV] + np.einsum("nij,nj->ni", R, whole.dv_mps))
+        miss_p = after_x[:, POS] - (
+            x[:, POS] + s * x[:, VEL] + 0.5 * s**2 * x[:, GRAV] + np.einsum("nij,nj->ni", R, whole.dp_m)
+        )
+        R_t = R_t @ matrix_from_rvec(a * miss_turn)
+        p = p + (3 * a**2 - 2 * a**3) * miss_p + s * (a**3 - a**2) * miss_v
+        v = v + 6 * (a - a**2) / s * miss_p + (3 * a**2 - 2 * a) * miss_v
+        cov = (1 - a[..., None]) * cov + a[..., None] * estimate.covariance[k + 1, b]
+    omega = run.signal.gyro_at(t) - x[:, BG]
+    state = State(R_t, np.concatenate([x[:, :3], p, v, x[:, 9:]], axis=1))
+    zero = np.zeros(len(t))
+    R_out, p_out, H = observe(state, omega, run.lever_arm_m, t_cam - run.t_mid_s, zero)
+    P = H @ cov @ np.swapaxes(H, 1, 2)
+    _add_bridge(P, problem, k, b, dt, nodes, is_smoothed=is_smoothed)
+    # Errors that the frames have in common: the median frame stands for all.
+    P = P + settings.optical_common_share**2 * np.median(problem.cov_seen[nodes.node_of_frame, b], axis=0)
+    v_out = v - np.einsum("nij,nj->ni", R_t, np.cross(omega, run.lever_arm_m))
+
+    P = 0.5 * (P + np.swapaxes(P, 1, 2))
+    P[:, 3:] *= 1e3
+    P[:, :, 3:] *= 1e3
+    flags = _flags(run, lin, t_cam, t, used, settings)
+    flags[outside] |= int(PoseFlag.EXTRAPOLATED)
+    variance = np.diagonal(P, axis1=1, axis2=2)
+    unsure = (variance[:, 3:].max(axis=1) > settings.max_position_sd_mm**2) | (
+        variance[:, :3].max(axis=1) > settings.max_rotation_sd_rad**2
+    )
+    lost = outside | unsure
+    flags[lost] |= int(PoseFlag.NO_POSE)
+    t_mm, v_mmps = 1e3 * p_out, 1e3 * v_out
+    R_out, omega = R_out.copy(), omega.copy()
+    for values in (R_out, t_mm, omega, v_mmps, P):
+        values[lost] = np.nan
+    return FusedTrack(
+        t_ns=output_t_ns,
+        R_camera_brick=R_out,
+        t_camera_brick_mm=t_mm,
+        omega_brick_radps=omega,
+        v_camera_mmps=v_mmps,
+        covariance=P,
+        flags=flags,
+    )
+
+
+def _add_bridge(
+    P: FloatArray, problem: Problem, k: IntArray, b: int, dt: FloatArray, nodes: Nodes, *, is_smoothed: bool
+) -> None:
+    """Add what inertial noise makes unsure between two known nodes (or after one), in place."""
+    span = nodes.t_s[k + 1] - nodes.t_s[k]
+    a = dt / span
+    q_turn, q_acc = problem.gyro_var[k, b], problem.acc_var[k, b]
+    turn = q_turn * dt * ((1 - a) if is_smoothed else 1.0)
+    shift = q_acc * dt**3 / 3 * ((1 - a) ** 3 if is_smoothed else 1.0)
+    i = np.arange(3)
+    P[:, i, i] += turn[:, None]
+    P[:, 3 + i, 3 + i] += shift[:, None]
+
+
+def _near_sample(signal: ImuSignal, t_s: FloatArray, marked: BoolArray) -> BoolArray:
+    """Return which instants have a marked sample on either side."""
+    i = np.clip(np.searchsorted(signal.t_s, t_s), 1, len(signal.t_s) - 1)
+    return np.asarray(marked[i] | marked[i - 1])
+
+
+def _flags(
+    run: Run,
+    lin: Linearisation,
+    t_cam: FloatArray,
+    t_imu: FloatArray,
+    used: BoolArray,
+    settings: FusionSettings,
+) -> IntArray:
+    signal, frames = run.signal, run.t_cam_s[used]
+    i = np.clip(np.searchsorted(frames, t_cam), 1, max(len(frames) - 1, 1))
+    other = np.minimum(i, len(frames) - 1)
+    period = float(np.median(np.diff(run.t_cam_s))) if len(run.t_cam_s) > 1 else np.inf
+    away = np.minimum(np.abs(t_cam - frames[other]), np.abs(t_cam - frames[i - 1]))
+    slack = 1e-6
+    marks = {
+        PoseFlag.DROPOUT: away > 1.5 * period,
+        PoseFlag.EXTRAPOLATED: (t_cam < frames[0] - slack) | (t_cam > frames[-1] + slack),
+        PoseFlag.IMPACT: _near_sample(signal, t_imu, signal.acc_impact_mps2 > settings.impact_mps2),
+        PoseFlag.CLIPPED: _near_sample(signal, t_imu, signal.clip_sd_mps2 > 0),
+        PoseFlag.IMU_GAP: signal.in_gap(t_imu),
+    }
+    flags = np.zeros(len(t_cam), dtype=np.int64)
+    for flag, where in marks.items():
+        flags[where] |= int(flag)
+    return flags

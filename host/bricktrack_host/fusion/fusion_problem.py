@@ -1,0 +1,344 @@
+"""From tracks to the smoother's problem: nodes in time, noise of each step, start values and their sd."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.smoother import (
+    ATT,
+    BA,
+    BG,
+    GRAV,
+    LAG,
+    N_STATES,
+    POS,
+    SKEW,
+    TAU,
+    VEL,
+    Problem,
+    State,
+)
+from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
+from bricktrack_host.tracks import ImuTrack, OpticalTrack
+
+_MIN_POSITION_SD_M = 2e-6  # a covariance below this is not believed
+_SAME_NODE_S = 2e-4  # grid nodes this near to a frame are left out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearisation:
+    """Where nodes are placed and increments taken."""
+
+    tau_s: float
+    skew: float
+    lag_s: float
+    bg_radps: FloatArray
+    ba_mps2: FloatArray
+    R_first: FloatArray
+    v_first_mps: FloatArray
+    p_first_m: FloatArray
+    gravity_mps2: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One run's inputs, in seconds after the IMU's first sample and metres.
+
+    Attributes
+    ----------
+    t_cam_s : ndarray, shape (n,)
+        Frames with a pose, camera time.
+    frame : ndarray of int64, shape (n,)
+        Their index in the optical track.
+    """
+
+    signal: ImuSignal
+    alignment: TimeAlignment
+    lever_arm_m: FloatArray
+    t_cam_s: FloatArray
+    frame: IntArray
+    R_seen: FloatArray
+    p_seen_m: FloatArray
+    cov_seen: FloatArray
+    t_mid_s: float
+    span_cam_s: tuple[float, float]
+
+    @classmethod
+    def from_tracks(
+        cls,
+        optical: OpticalTrack,
+        imu: ImuTrack,
+        alignment: TimeAlignment,
+        *,
+        lever_arm_mm: FloatArray,
+        output_t_ns: IntArray,
+    ) -> "Run":
+        """Return what of a run is used: frames with a pose, and the time to be covered."""
+        signal = ImuSignal.from_track(imu)
+        seen = np.flatnonzero(has_pose(optical))
+        t_cam_s = seconds_since(optical.t_ns[seen], signal.epoch_ns)
+        cov = optical.covariance[seen].copy()
+        cov[:, 3:] *= 1e-3
+        cov[:, :, 3:] *= 1e-3
+        floor = np.repeat([MIN_ROTATION_SD_RAD**2, _MIN_POSITION_SD_M**2], 3)
+        cov = 0.5 * (cov + np.swapaxes(cov, 1, 2)) + np.diag(floor)
+        # IMU samples in camera time, as far as they reach beyond the frames.
+        first = min(float(t_cam_s[0]), float(signal.t_s[0]) - alignment.offset_ns * 1e-9)
+        last = max(float(t_cam_s[-1]), float(signal.t_s[-1]) - alignment.offset_ns * 1e-9)
+        wanted_s = seconds_since(output_t_ns, signal.epoch_ns)
+        span = (
+            float(min(t_cam_s[0], max(first, wanted_s.min(initial=np.inf)))),
+            float(max(t_cam_s[-1], min(last, wanted_s.max(initial=-np.inf)))),
+        )
+        return cls(
+            signal=signal,
+            alignment=alignment,
+            lever_arm_m=lever_arm_mm * 1e-3,
+            t_cam_s=t_cam_s,
+            frame=seen.astype(np.int64),
+            R_seen=optical.R_camera_brick[seen],
+            p_seen_m=optical.t_camera_brick_mm[seen] * 1e-3,
+            cov_seen=cov,
+            t_mid_s=(alignment.t_mid_ns - signal.epoch_ns) * 1e-9,
+            span_cam_s=span,
+        )
+
+    def imu_time_s(self, t_cam_s: FloatArray, lin: Linearisation) -> FloatArray:
+        """Return IMU time of camera time at the linearisation point."""
+        return np.asarray(t_cam_s + lin.tau_s + lin.skew * (t_cam_s - self.t_mid_s))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nodes:
+    """The instants of the filter, IMU time, and which frame stands at which."""
+
+    t_s: FloatArray
+    node_of_frame: IntArray
+
+
+def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
+    """Return start values from the alignment, the optical attitudes and the accelerometer.
+
+    Averaged over a run, specific force turned into camera axes is minus gravity: the brick ends near where
+    it began.
+    """
+    a = run.alignment
+    tau, lag = a.offset_ns * 1e-9, settings.acc_lag_ns * 1e-9
+    t_imu = run.t_cam_s + tau + a.skew * (run.t_cam_s - run.t_mid_s)
+    whole = ~run.signal.in_gap(t_imu)
+    whole = whole if whole.any() else np.ones(len(t_imu), dtype=bool)
+    force = np.einsum("nij,nj->ni", run.R_seen[whole], run.signal.acc_at(t_imu[whole] + lag))
+    # The median is not drawn by a few impacts, and its direction is all that is taken.
+    down = -np.median(force, axis=0)
+    norm = float(np.linalg.norm(down))
+    down = down / norm if norm > 0 else np.array([0.0, 1.0, 0.0])
+    return Linearisation(
+        tau_s=tau,
+        skew=a.skew,
+        lag_s=lag,
+        bg_radps=np.asarray(a.gyro_bias_radps, dtype=np.float64),
+        ba_mps2=np.zeros(3),
+        R_first=run.R_seen[0],
+        v_first_mps=np.zeros(3),
+        p_first_m=run.p_seen_m[0] + run.R_seen[0] @ run.lever_arm_m,
+        gravity_mps2=down * settings.gravity_mps2,
+    )
+
+
+def place_nodes(run: Run, lin: Linearisation) -> Nodes:
+    """Return a grid at the IMU's rate with the frames' instants let in, a step wider than what is wanted."""
+    t_frame = run.imu_time_s(run.t_cam_s, lin)
+    lo, hi = run.imu_time_s(np.array(run.span_cam_s), lin)
+    step = run.signal.period_s
+    n = int(np.ceil((hi - lo) / step)) + 2
+    grid = np.linspace(lo - step, hi + step, n + 1)
+    i = np.clip(np.searchsorted(t_frame, grid), 1, len(t_frame) - 1) if len(t_frame) > 1 else None
+    near = (
+        np.minimum(np.abs(grid - t_frame[i]), np.abs(grid - t_frame[i - 1]))
+        if i is not None
+        else np.abs(grid - t_frame[0])
+    )
+    t_s = np.sort(np.concatenate([grid[near > _SAME_NODE_S], t_frame]))
+    return Nodes(t_s, np.searchsorted(t_s, t_frame).astype(np.int64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseParts:
+    """Spectral densities of inertial errors at instants, by cause; shape (n,), rad^2/s and m^2/s^3.
+
+    Attributes
+    ----------
+    gyro_fixed, acc_fixed
+        White noise of the samples, impacts, clipping, and gaps, where the signal is only bridged and its
+        whole spread is the error.
+    gyro_rough, acc_rough
+        Steady roughness beyond the sensor's own noise, at a share of 1.
+    gyro_systematic, acc_systematic
+        Scale and lever-arm errors in proportion to the motion, which keep their sign for a while.
+    """
+
+    gyro_fixed: FloatArray
+    gyro_rough: FloatArray
+    gyro_systematic: FloatArray
+    acc_fixed: FloatArray
+    acc_rough: FloatArray
+    acc_systematic: FloatArray
+
+    def gyro(self, level: "NoiseLevel") -> FloatArray:
+        """Return the whole density for one level."""
+        return np.asarray(
+            self.gyro_fixed
+            + level.roughness**2 * self.gyro_rough
+            + level.systematic**2 * self.gyro_systematic
+        )
+
+    def acc(self, level: "NoiseLevel") -> FloatArray:
+        """Return the whole density for one level."""
+        return np.asarray(
+            self.acc_fixed + level.roughness**2 * self.acc_rough + level.systematic**2 * self.acc_systematic
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseLevel:
+    """How much of the roughness, and how many times the stated systematic error, is believed to be error."""
+
+    roughness: float
+    systematic: float
+
+
+def noise_parts(
+    signal: ImuSignal, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
+) -> NoiseParts:
+    """Return how far the inertial signal is to be trusted at instants of IMU time."""
+    s, period, hold = settings, signal.period_s, settings.systematic_time_s
+    gyro = signal.gyro_radps - lin.bg_radps
+    turn = np.linalg.norm(np.gradient(gyro, signal.t_s, axis=0), axis=1)
+    size = np.linalg.norm(gyro, axis=1)
+    # What of the force is not constant in the body: the constant part is the bias state's.
+    moving = np.linalg.norm(signal.acc_mps2 - np.median(signal.acc_mps2, axis=0), axis=1)
+    arm_m = s.lever_arm_sd_mm * 1e-3
+
+    def at(values: FloatArray, shift_s: float) -> FloatArray:
+        return np.interp(t_s + shift_s, signal.t_s, values)
+
+    gap = np.where(signal.in_gap(t_s), hold, 0.0)
+    gyro_fixed = s.gyro_noise_radps**2 + (s.impact_share * signal.gyro_impact_radps) ** 2
+    acc_fixed = s.acc_noise_mps2**2 + (s.impact_share * signal.acc_impact_mps2) ** 2 + signal.clip_sd_mps2**2
+    gyro_rough = np.maximum(signal.gyro_roughness_radps**2 - s.gyro_noise_radps**2, 0.0)
+    acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
+    acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2
+    return NoiseParts(
+        gyro_fixed=at(gyro_fixed * period, 0.0) + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2,
+        gyro_rough=at(gyro_rough * period, 0.0),
+        gyro_systematic=at((s.gyro_scale_sd * size) ** 2 * hold, 0.0),
+        acc_fixed=at(acc_fixed * period, lin.lag_s) + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2,
+        acc_rough=at(acc_rough * period, lin.lag_s),
+        acc_systematic=at(acc_systematic * hold, lin.lag_s),
+    )
+
+
+def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> FloatArray:
+    """Return the covariance of the start values, shape (21, 21): wide where the first frames will tell."""
+    s, a = settings, run.alignment
+    sd = np.zeros(N_STATES)
+    sd[ATT], sd[POS], sd[VEL] = 0.2, 1.0, 1.0
+    sd[BG], sd[BA], sd[GRAV] = s.gyro_bias_sd_radps, s.acc_bias_sd_mps2, 0.5
+    if a.source == "data":
+        sd[TAU] = max(s.offset_prior_sd_ns, a.offset_sd_ns) * 1e-9
+        sd[SKEW] = 2 * a.skew_sd
+    else:
+        sd[TAU], sd[SKEW] = a.offset_sd_ns * 1e-9, a.skew_sd
+    sd[LAG] = s.acc_lag_sd_ns * 1e-9
+    P = np.diag(sd**2)
+    along = lin.gravity_mps2 / np.linalg.norm(lin.gravity_mps2)
+    P[GRAV, GRAV] += (s.gravity_sd_mps2**2 - sd[GRAV.start] ** 2) * np.outer(along, along)
+    return P
+
+
+def build_problem(
+    runs: list[Run],
+    nodes: list[Nodes],
+    lins: list[Linearisation],
+    *,
+    settings: FusionSettings,
+    use_frame: list[BoolArray],
+    noise_scale: list[FloatArray],
+    levels: list[tuple[NoiseLevel, NoiseLevel]],
+) -> tuple[Problem, list[NoiseParts]]:
+    """Return the batch's arrays, time first; shorter runs are padded with steps of no duration.
+
+    Parameters
+    ----------
+    use_frame : list of ndarray of bool, shape (n_frames,)
+    noise_scale : list of ndarray, shape (2,)
+        Factors on the stated sd of optical rotation and position.
+    levels : list of (NoiseLevel, NoiseLevel)
+        Of gyro and accelerometer.
+
+    Returns
+    -------
+    problem, parts : Problem, list of NoiseParts
+        The parts at the steps of each run, from which other levels can be made.
+    """
+    parts: list[NoiseParts] = []
+    n_nodes, n_runs = max(len(n.t_s) for n in nodes), len(runs)
+    steps, eye = (n_nodes - 1, n_runs), np.eye(3)
+    zeros3 = np.zeros((*steps, 3))
+    pr = Problem(
+        dt_s=np.zeros(steps),
+        R_step=np.broadcast_to(eye, (*steps, 3, 3)).copy(),
+        R_half=np.broadcast_to(eye, (*steps, 3, 3)).copy(),
+        dv_mps=zeros3.copy(),
+        dp_m=zeros3.copy(),
+        f_rate_mps3=zeros3.copy(),
+        gyro_var=np.zeros(steps),
+        acc_var=np.zeros(steps),
+        gyro_bias_walk=np.full(steps, settings.gyro_bias_walk_radps**2),
+        acc_bias_walk=np.full(steps, settings.acc_bias_walk_mps2**2),
+        omega_radps=np.zeros((n_nodes, n_runs, 3)),
+        has_frame=np.zeros((n_nodes, n_runs), dtype=np.bool_),
+        R_seen=np.broadcast_to(eye, (n_nodes, n_runs, 3, 3)).copy(),
+        p_seen_m=np.zeros((n_nodes, n_runs, 3)),
+        cov_seen=np.broadcast_to(np.eye(6), (n_nodes, n_runs, 6, 6)).copy(),
+        since_mid_s=np.zeros((n_nodes, n_runs)),
+        lever_arm_m=np.stack([r.lever_arm_m for r in runs]),
+        bg_lin=np.stack([x.bg_radps for x in lins]),
+        ba_lin=np.stack([x.ba_mps2 for x in lins]),
+        tau_lin=np.array([x.tau_s for x in lins]),
+        skew_lin=np.array([x.skew for x in lins]),
+        lag_lin=np.array([x.lag_s for x in lins]),
+        start=State(np.empty((n_runs, 3, 3)), np.zeros((n_runs, N_STATES))),
+        P_start=np.stack([start_covariance(r, x, settings) for r, x in zip(runs, lins, strict=True)]),
+    )
+    for b, (run, node, lin) in enumerate(zip(runs, nodes, lins, strict=True)):
+        k = len(node.t_s) - 1
+        step = run.signal.increments(
+            node.t_s[:-1],
+            node.t_s[1:],
+            gyro_bias_radps=lin.bg_radps,
+            acc_bias_mps2=lin.ba_mps2,
+            acc_lag_s=lin.lag_s,
+        )
+        pr.dt_s[:k, b] = np.diff(node.t_s)
+        pr.R_step[:k, b], pr.R_half[:k, b] = step.R, step.R_half
+        pr.dv_mps[:k, b], pr.dp_m[:k, b], pr.f_rate_mps3[:k, b] = step.dv_mps, step.dp_m, step.f_rate_mps3
+        middle = 0.5 * (node.t_s[1:] + node.t_s[:-1])
+        parts.append(noise_parts(run.signal, middle, lin, settings))
+        pr.gyro_var[:k, b], pr.acc_var[:k, b] = parts[b].gyro(levels[b][0]), parts[b].acc(levels[b][1])
+        pr.omega_radps[: k + 1, b] = run.signal.gyro_at(node.t_s)
+        at = node.node_of_frame
+        pr.has_frame[at, b] = use_frame[b]
+        pr.R_seen[at, b], pr.p_seen_m[at, b] = run.R_seen, run.p_seen_m
+        scale = np.repeat(noise_scale[b], 3)
+        pr.cov_seen[at, b] = run.cov_seen * scale[:, None] * scale
+        pr.since_mid_s[at, b] = run.t_cam_s - run.t_mid_s
+        pr.start.R[b] = lin.R_first
+        x = pr.start.x[b]
+        x[POS], x[VEL], x[BG], x[GRAV] = lin.p_first_m, lin.v_first_mps, lin.bg_radps, lin.gravity_mps2
+        x[TAU], x[SKEW] = run.alignment.offset_ns * 1e-9, run.alignment.skew
+        x[LAG] = settings.acc_lag_ns * 1e-9
+    return pr, parts

@@ -1,0 +1,1 @@
+"""Recordings as pictures with their time, and recordings made by other means."""

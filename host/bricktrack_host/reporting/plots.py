@@ -1,0 +1,254 @@
+"""The figures of a run's report, each a matplotlib `Figure` made from values; no state is shared."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import welch
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.results.result_store import RunResult
+from bricktrack_host.results.run_summary import KeyFigures, main_track
+
+INK = "#22272e"
+FUSED = "#1f5f8b"
+OPTICAL = "#c8651b"
+TRUTH = "#2f7d4f"
+SHADE = "#e6e2da"
+IMPACT = "#b3261e"
+# Seven hues that stay apart for colour-blind readers (after P. Tol's "bright" scheme), in LED order.
+LED_COLOURS = ("#4477aa", "#ee6677", "#228833", "#b89b1e", "#2fa6c2", "#aa3377", "#777777")
+WIDTH_IN = 10.4
+
+STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8.5,
+    "axes.edgecolor": "#8a8f98",
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.xmargin": 0.01,
+    "grid.color": "#e3e5e8",
+    "grid.linewidth": 0.6,
+    "xtick.color": "#5b616b",
+    "ytick.color": "#5b616b",
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "text.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "lines.linewidth": 1.0,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "bricktrack",
+    "path.simplify_threshold": 0.2,
+    "figure.constrained_layout.use": True,
+}
+"""For `matplotlib.rc_context` around making *and* saving the figures."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameOverlay:
+    """A decoded frame with the LEDs as seen and as predicted.
+
+    Attributes
+    ----------
+    title : str
+    image : ndarray of uint8, shape (rows, columns) grey or (rows, columns, 3) RGB
+    detected_uv_px, predicted_uv_px : ndarray, shape (n, 2), px
+        NaN where there is none.
+    """
+
+    title: str
+    image: NDArray[np.uint8]
+    detected_uv_px: FloatArray
+    predicted_uv_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationPicture:
+    """Where the calibration's dots were.
+
+    Attributes
+    ----------
+    width_px, height_px : int
+    covered_uv_px : sequence of ndarray, shape (k, 2), px
+        Outlines of the region that dots surrounded, one for each plane or for all.
+    dots_uv_px : ndarray, shape (n, 2), px
+    residual_um : ndarray, shape (n, 2), um, or None
+        On the target, along u and v: dot seen less fitted.
+    """
+
+    width_px: int
+    height_px: int
+    covered_uv_px: Sequence[FloatArray]
+    dots_uv_px: FloatArray
+    residual_um: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TimeAxis:
+    """Seconds from the trigger, or from the first frame where no trigger came."""
+
+    origin_ns: int
+    label: str
+
+    @classmethod
+    def of(cls, result: RunResult) -> "TimeAxis":
+        """Return the time axis of a run."""
+        if result.t0_ns is not None:
+            return cls(result.t0_ns, "time since the trigger, s")
+        stamps = result.observations.sensor_timestamp_ns
+        return cls(int(stamps[0]) if len(stamps) else 0, "time since the first frame, s (no trigger)")
+
+    def s(self, t_ns: IntArray) -> FloatArray:
+        """Return times as seconds of this axis."""
+        return np.asarray((t_ns - self.origin_ns) / 1e9)
+
+
+def style() -> Any:
+    """Return the context in which figures are made and saved."""
+    return mpl.rc_context(STYLE)
+
+
+def motion_figure(
+    result: RunResult, figures: KeyFigures, *, span_s: tuple[float, float] | None = None
+) -> Figure:
+    """Return six time histories: from rest where there is a rest pose, else in the camera frame.
+
+    ``span_s`` limits the time axis, for a close-up.
+    """
+    axis = TimeAxis.of(result)
+    fig = Figure(figsize=(WIDTH_IN, 9.6 if span_s is None else 6.0))
+    axes = fig.subplots(6 if span_s is None else 3, 1 if span_s is None else 2, sharex=True, squeeze=False)
+    panels = axes[:, 0] if span_s is None else axes.T.reshape(-1)
+    track = main_track(result)
+    optical = result.optical
+    optical_s = axis.s(optical.t_ns)
+    optical_y, optical_sd = _six(
+        result, optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance
+    )
+    chosen = slice(None) if span_s is None else (optical_s >= span_s[0]) & (optical_s <= span_s[1])
+    inside: Any = slice(None)
+    if track is not None:
+        fused_s = axis.s(track.t_ns)
+        inside = track.flags & int(PoseFlag.EXTRAPOLATED) == 0
+        if span_s is not None:
+            inside &= (fused_s >= span_s[0]) & (fused_s <= span_s[1])
+        fused_y, fused_sd = _six(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
+    d = "d" if result.rest is not None else ""
+    names = [f"{d}x, mm", f"{d}y, mm", f"{d}z, mm", f"{d}rot x, deg", f"{d}rot y, deg", f"{d}rot z, deg"]
+    for i, ax in enumerate(panels):
+        mark_events(ax, axis, result, figures)
+        if track is not None:
+            y, half = fused_y[inside, i], 1.96 * fused_sd[inside, i]
+            ax.fill_between(
+                fused_s[inside], y - half, y + half, color=FUSED, alpha=0.22, lw=0, label="95 % band"
+            )
+            ax.plot(fused_s[inside], y, color=FUSED, lw=0.9, label="fused")
+        if span_s is None:
+            ax.plot(optical_s, optical_y[:, i], ".", color=OPTICAL, ms=3, mew=0, label="optical")
+        else:
+            ax.errorbar(
+                optical_s[chosen], optical_y[chosen, i], 1.96 * optical_sd[chosen, i], fmt="o", color=OPTICAL,
+                ms=3, mew=0, elinewidth=0.8, label="optical, 95 %",
+            )  # fmt: skip
+        ax.set_ylabel(names[i])
+        if span_s is not None:
+            ax.set_xlim(*span_s)
+    figure_legend(fig, panels)
+    for ax in axes[-1]:
+        ax.set_xlabel(axis.label)
+    fig.align_ylabels()
+    return fig
+
+
+def spectrum_figure(result: RunResult) -> Figure | None:
+    """Return amplitude spectra of the motion at inertial slots; `None` where it is too short."""
+    track = main_track(result)
+    if track is None:
+        return None
+    inside = track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) == 0
+    inside &= np.isfinite(track.t_camera_brick_mm).all(axis=1)
+    if np.count_nonzero(inside) < 64:
+        return None
+    t_s = (track.t_ns[inside] - track.t_ns[inside][0]) / 1e9
+    step_s = float(np.median(np.diff(t_s)))
+    even_s = np.arange(0, t_s[-1], step_s)
+    values, _ = _six(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
+    camera = result.manifest.camera
+    nyquist_hz = 0.5e6 / camera.frame_duration_us if camera and camera.frame_duration_us > 0 else None
+    fig = Figure(figsize=(WIDTH_IN, 2.9))
+    axes = fig.subplots(1, 2)
+    for i in range(6):
+        y = np.interp(even_s, t_s, values[inside, i])
+        n = min(len(y), 512)
+        f_hz, power = welch(y, 1 / step_s, nperseg=n, detrend="constant")
+        ax = axes[i // 3]
+        ax.semilogy(f_hz[1:], np.sqrt(power[1:]), color=LED_COLOURS[i % 3], label="xyz"[i % 3])
+    axes[0].set_title("Displacement")
+    axes[0].set_ylabel("mm / sqrt(Hz)")
+    axes[1].set_title("Rotation")
+    axes[1].set_ylabel("deg / sqrt(Hz)")
+    for ax in axes:
+        ax.set_xlabel("frequency, Hz")
+        ax.set_xlim(0, 0.5 / step_s)
+        if nyquist_hz is not None:
+            ax.axvline(nyquist_hz, color=INK, lw=0.7, ls=":")
+        ax.legend(loc="upper right")
+    return fig
+
+
+def _six(
+    result: RunResult, R: FloatArray, t_mm: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return x, y, z, mm, and rotation vector, deg, from rest if there is one, with their deviations."""
+    rotation_sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, :3]
+    if result.rest is None:
+        position_sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, 3:]
+        turn = rvec_from_matrix(R)
+    else:
+        moved = result.rest.relative(R, t_mm)
+        R_camera_rest = result.rest.R_camera_rest
+        turned = R_camera_rest.T @ covariance[:, 3:, 3:] @ R_camera_rest
+        position_sd = np.sqrt(np.diagonal(turned, axis1=1, axis2=2))
+        t_mm, turn = moved.t_mm, rvec_from_matrix(moved.R)
+    return (
+        np.concatenate([t_mm, np.rad2deg(turn)], axis=1),
+        np.concatenate([position_sd, np.rad2deg(rotation_sd)], axis=1),
+    )
+
+
+def mark_events(ax: Axes, axis: TimeAxis, result: RunResult, figures: KeyFigures) -> None:
+    """Shade the dropouts, and mark trigger and impacts."""
+    for n, (first, last) in enumerate(axis.s(figures.dropouts_ns).tolist()):
+        ax.axvspan(first, last, color=SHADE, lw=0, label="no optical pose used" if n == 0 else None)
+    for n, t_s in enumerate(axis.s(figures.impacts_ns).tolist()):
+        ax.axvline(t_s, color=IMPACT, lw=0.8, alpha=0.75, label="impact" if n == 0 else None)
+    if result.t0_ns is not None:
+        ax.axvline((result.t0_ns - axis.origin_ns) / 1e9, color=INK, lw=0.7, ls=(0, (4, 3)), label="trigger")
+
+
+def figure_legend(fig: Figure, axes: Iterable[Axes]) -> None:
+    """Put one legend of everything that the axes show in a row above the figure, right."""
+    entries: dict[str, Any] = {}
+    for ax in axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    if entries:
+        fig.legend(
+            list(entries.values()), list(entries), loc="outside upper right", ncols=len(entries),
+            borderaxespad=0.2, columnspacing=1.4, handletextpad=0.5, markerscale=2,
+        )  # fmt: skip

@@ -1,0 +1,304 @@
+"""The sections of a run's report: words, tables and embedded figures, ready for the template."""
+
+import base64
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.reporting import quality_plots
+from bricktrack_host.reporting.plots import (
+    CalibrationPicture,
+    FrameOverlay,
+    TimeAxis,
+    motion_figure,
+    spectrum_figure,
+)
+from bricktrack_host.results.result_store import DetailValue, RunResult
+from bricktrack_host.results.run_summary import KeyFigures, main_track
+from bricktrack_host.results.truth import COMPONENTS, GroupErrors, TruthComparison
+
+_SMALL_BYTES = 150_000  # an SVG below this is kept without trying the other
+_PNG_DPI = 190  # sharp on a screen of twice the usual density at the page's width
+
+
+@dataclass(frozen=True, slots=True)
+class ReportExtras:
+    """What the results on disk do not hold and the report can show.
+
+    Attributes
+    ----------
+    overlays : sequence of FrameOverlay
+    calibration : CalibrationPicture or None
+    truth : TruthComparison or None
+        For simulated runs.
+    """
+
+    overlays: Sequence[FrameOverlay] = ()
+    calibration: CalibrationPicture | None = None
+    truth: TruthComparison | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EmbeddedFigure:
+    """A figure as a data URI with its caption."""
+
+    uri: str
+    alt: str
+    caption: str = ""
+    half: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SectionTable:
+    """A table of text; the first ``n_words`` columns are words, the others numbers."""
+
+    title: str
+    head: list[str]
+    rows: list[list[str]]
+    n_words: int
+
+
+@dataclass(slots=True)
+class Section:
+    """One section of the report."""
+
+    id: str
+    title: str
+    words: list[str] = field(default_factory=list)
+    figures: list[EmbeddedFigure] = field(default_factory=list)
+    tables: list[SectionTable] = field(default_factory=list)
+    overlays: bool = False
+
+
+def report_sections(result: RunResult, figures: KeyFigures, extras: ReportExtras) -> list[Section]:
+    """Return what there is to show of a run, in order; call it inside `plots.style`."""
+    sections = []
+    if figures.n_poses:
+        sections.append(_motion_section(result, figures))
+    if extras.truth is not None:
+        sections.append(_truth_section(result, figures, extras.truth))
+    if figures.n_poses:
+        sections.append(_residual_section(result))
+    if extras.overlays:
+        words = "Rings: where an LED was seen. Crosses: where the pose puts it."
+        shown = [
+            _embed(quality_plots.overlay_figure(o), f"LEDs laid over {o.title}") for o in extras.overlays
+        ]
+        sections.append(Section("pictures", "LEDs in the pictures", [words], shown, overlays=True))
+    timing = _embed(
+        quality_plots.timing_figure(result, figures),
+        "Frame intervals, lateness of inertial slots, residuals of the square wave's edges",
+    )
+    sections.append(Section("timing", "Timing", _timing_words(result, figures), [timing]))
+    sections += _alignment_section(result)
+    calibration = Section("calibration", "Calibration")
+    if result.calibration:
+        rows = [[in_words(name), value_text(value)] for name, value in result.calibration.items()]
+        calibration.tables.append(SectionTable("", ["", ""], rows, 2))
+    if extras.calibration is not None:
+        picture = quality_plots.calibration_figure(extras.calibration, result.observations.uv_px)
+        caption = (
+            "Rays outside the covered region are extrapolated; poses that use one are flagged uncovered."
+        )
+        calibration.figures.append(_embed(picture, "Region covered by calibration dots", caption, half=True))
+    if calibration.tables or calibration.figures:
+        sections.append(calibration)
+    return sections
+
+
+def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
+    if result.rest is not None:
+        seconds = (result.rest.interval_ns[1] - result.rest.interval_ns[0]) / 1e9
+        source = "given" if result.rest.source == "given" else "found by stillness"
+        words = (
+            "Displacement of the first LED, and rotation vector, from rest, in the brick's axes at rest. "
+            f"The rest pose is the mean of {result.rest.n_frames} frames over {seconds:.2f} s ({source})."
+        )
+    else:
+        words = "No rest pose: position of the first LED and rotation vector in the camera frame."
+    whole = _embed(
+        motion_figure(result, figures), "Time histories of three displacements and three rotations",
+        "Line: fused motion, 95 % band. Dots: optical poses. Shaded: no optical pose used. Red: impacts.",
+    )  # fmt: skip
+    section = Section("motion", "Motion", [words], [whole])
+    span = _closeup(result, figures)
+    if span is not None:
+        section.figures.append(
+            _embed(motion_figure(result, figures, span_s=span), "Close-up of the time histories",
+                   "Close-up around the highest speed. Bars: 95 % of each optical pose.")
+        )  # fmt: skip
+    spectrum = spectrum_figure(result)
+    if spectrum is not None:
+        section.figures.append(
+            _embed(
+                spectrum,
+                "Spectra of displacement and rotation",
+                "Amplitude density of the fused motion. Dotted: half the frame rate.",
+            )
+        )
+    return section
+
+
+def _closeup(result: RunResult, figures: KeyFigures) -> tuple[float, float] | None:
+    track = main_track(result)
+    if track is None:
+        return None
+    speed = np.linalg.norm(track.v_camera_mmps, axis=1)
+    speed[track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) != 0] = np.nan
+    if not np.isfinite(speed).any() or figures.duration_s < 1.0:
+        return None
+    origin_ns = TimeAxis.of(result).origin_ns
+    middle_s = float((track.t_ns[int(np.nanargmax(speed))] - origin_ns) / 1e9)
+    return middle_s - 0.3, middle_s + 0.3
+
+
+def _residual_section(result: RunResult) -> Section:
+    section = Section("residuals", "Residuals of the LEDs", [
+        "Where each LED was seen less where the pose puts it. A single LED that stays off hints at the "
+        "layout or a reflection; all of them off together near the picture's edge hint at the calibration."
+    ])  # fmt: skip
+    rows = []
+    for i, name in enumerate(result.led_names):
+        residual = result.optical.residual_px[:, i]
+        used = residual[np.isfinite(residual).all(axis=1)]
+        mean = used.mean(axis=0) if len(used) else np.full(2, np.nan)
+        rms = np.sqrt(np.mean(used**2, axis=0)) if len(used) else np.full(2, np.nan)
+        largest = np.linalg.norm(used, axis=1).max() if len(used) else np.nan
+        cells = [str(len(used)), *(f"{x:.3f}" for x in (*mean, *rms, largest))]
+        rows.append([name, *cells])
+    head = ["LED", "frames used", "mean u, px", "mean v, px", "rms u, px", "rms v, px", "largest, px"]
+    section.tables.append(SectionTable("", head, rows, 1))
+    section.figures = [
+        _embed(quality_plots.residual_time_figure(result), "Residuals of each LED over time",
+               "Crosses at the border: beyond the axis."),
+        _embed(quality_plots.residual_picture_figure(result), "LEDs in the picture with their mean residuals",
+               "Where the LEDs were in the picture; arrows: mean residual of each, enlarged.", half=True),
+    ]  # fmt: skip
+    return section
+
+
+def _timing_words(result: RunResult, figures: KeyFigures) -> list[str]:
+    words = [
+        f"{figures.n_frames} frames, median interval {figures.frame_period_ns / 1e6:.4f} ms "
+        f"({1e9 / figures.frame_period_ns:.4f} a second), {figures.n_frames_dropped} missing between them."
+        if figures.n_frames > 1
+        else f"{figures.n_frames} frames."
+    ]
+    fit = result.edge_fit
+    if fit is not None:
+        rate = "" if fit.nominal_hz is None else (
+            f"; the period is {fit.rate_ppm:+.2f} ± {1.96 * fit.rate_sd_ppm:.2f} ppm longer by this clock "
+            f"than that of {fit.nominal_hz:g} Hz"
+        )  # fmt: skip
+        words.append(
+            f"{fit.n_edges} edges of the square wave, {fit.missed_index.size} missed, "
+            f"{int(fit.is_extra.sum())} extra{rate}; residual {fit.residual_rms_ns / 1000:.1f} us rms, "
+            f"{fit.residual_max_ns / 1000:.1f} us at most."
+        )
+    return words
+
+
+def _alignment_section(result: RunResult) -> list[Section]:
+    offset_ms = result.alignment.get("imu_minus_camera_ms", result.alignment.get("offset_ms", 0.0))
+    offset_ns = round(float(offset_ms) * 1e6) if isinstance(offset_ms, (int, float)) else 0
+    figure = quality_plots.alignment_figure(result, imu_minus_camera_ns=offset_ns)
+    if figure is None and not result.alignment:
+        return []
+    section = Section("alignment", "Camera and inertial sensor")
+    if result.alignment:
+        rows = [[in_words(name), value_text(value)] for name, value in result.alignment.items()]
+        section.tables.append(SectionTable("", ["", ""], rows, 2))
+    if figure is not None:
+        section.figures.append(_embed(
+            figure, "Angular rates of gyroscope and optics",
+            "Above: the second in which the brick turns fastest. Below: the gyroscope's mean between two "
+            "frames, less bias, less the optical rate; what follows the motion there is a time offset.",
+        ))  # fmt: skip
+    return [section]
+
+
+def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthComparison) -> Section:
+    section = Section("truth", "Errors against the simulated truth", [
+        "Root mean square / largest magnitude: position in mm, rotation vector of the error in degrees about "
+        "the brick's axes. Honest covariances give a NEES/6 of 1, and 95 % of poses in their 95 % region."
+    ])  # fmt: skip
+    units = ["mm", "mm", "mm", "deg", "deg", "deg"]
+    head = ["track", "instants", "n", "without"]
+    names = [f"{c}, {u}" for c, u in zip(COMPONENTS, units, strict=True)]
+
+    def cells(g: GroupErrors) -> list[str]:
+        pairs = [f"{r:.3f} / {m:.3f}" if g.n else "–" for r, m in zip(g.rms, g.largest, strict=True)]
+        return [g.source, g.group, str(g.n), str(g.n_without), *pairs]
+
+    def honesty(g: GroupErrors) -> list[str]:
+        known = np.isfinite(g.nees_mean)
+        return [f"{g.nees_mean:.2f}", f"{100 * g.nees_within_95:.0f} %"] if known else ["–", "–"]
+
+    rows = [[*cells(g), *honesty(g)] for g in truth.groups]
+    section.tables.append(
+        SectionTable("Camera frame, nothing zeroed", [*head, *names, "NEES/6", "in 95 %"], rows, 2)
+    )
+    if truth.from_rest:
+        section.tables.append(
+            SectionTable(
+                "From rest, brick axes at rest", [*head, *names], [cells(g) for g in truth.from_rest], 2
+            )
+        )
+    section.figures.append(
+        _embed(quality_plots.truth_figure(result, figures, truth), "Errors against the truth over time",
+               "Band: what the fused covariances promise, 95 %. The tables hold errors beyond the axes.")
+    )  # fmt: skip
+    return section
+
+
+def _embed(figure: Figure, alt: str, caption: str = "", *, half: bool = False) -> EmbeddedFigure:
+    """Return the figure as a data URI: SVG, or PNG where that is smaller."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # the layout is found; finding it again takes most of a save's time
+    svg, png = io.BytesIO(), io.BytesIO()
+    figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+    kind, data = "svg+xml", svg.getvalue()
+    if len(data) > _SMALL_BYTES:
+        figure.savefig(png, format="png", dpi=_PNG_DPI, metadata={"Software": None})
+        if png.tell() < len(data):
+            kind, data = "png", png.getvalue()
+    return EmbeddedFigure(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", alt, caption, half)
+
+
+def in_words(name: str) -> str:
+    """Return a key as words, its unit behind a comma: ``offset_ms`` as ``offset, ms``."""
+    words, _, unit = name.rpartition("_")
+    if words and unit in {
+        "ms",
+        "us",
+        "ns",
+        "s",
+        "ppm",
+        "um",
+        "mm",
+        "px",
+        "hz",
+        "deg",
+        "mps2",
+        "radps",
+        "dps",
+    }:
+        return f"{words.replace('_', ' ')}, {unit}"
+    return name.replace("_", " ")
+
+
+def value_text(value: DetailValue) -> str:
+    """Return a value as people read it."""
+    if value is None or value == "":
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(value_text(v) for v in value)
+    return str(value)

@@ -1,0 +1,1 @@
+"""What users take away: tables, rest pose, the laboratory's samples, errors against truth."""

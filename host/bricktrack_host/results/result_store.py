@@ -1,0 +1,374 @@
+"""The processed result of a run, on disk: Parquet tables, their CSV twins and a summary, all or nothing.
+
+Everything but `timings.json` depends on the recording, the settings and the software alone: the same run
+processed again gives the same bytes.
+"""
+
+import importlib.metadata
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from bricktrack_common.arrays import IntArray
+from bricktrack_common.errors import RunFormatError, StorageError
+from bricktrack_common.run_manifest import RunManifest
+from bricktrack_common.typed_data import dump_json, load_json
+from bricktrack_host.durable_files import sync_file, sync_folder
+from bricktrack_host.results.daq_clock import EdgeFit, fit_edges
+from bricktrack_host.results.rest_pose import RestPose
+from bricktrack_host.results.result_tables import (
+    CONVENTIONS,
+    FusedKind,
+    edges_table,
+    fused_from_table,
+    fused_table,
+    imu_from_table,
+    imu_table,
+    leds_table,
+    optical_from_tables,
+    optical_table,
+)
+from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
+
+RESULTS_SCHEMA = "bricktrack.results"
+RESULTS_VERSION = 1
+SUMMARY_NAME = "summary.json"
+TIMINGS_NAME = "timings.json"
+
+DetailValue = str | int | float | bool | None | list[str | int | float | bool | None]
+Details = dict[str, DetailValue]
+"""Named facts for the summary and the report; names carry their units."""
+
+
+class Provenance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the numbers come from.
+
+    Attributes
+    ----------
+    manifest_sha256 : str
+        Of the run's manifest, which holds the hashes of everything recorded.
+    calibration_sha256, layout_sha256 : str or None
+        Of the files used; `None` where none was.
+    settings : dict
+        Every setting of the processing that can change a number.
+    """
+
+    manifest_sha256: str
+    calibration_sha256: str | None
+    layout_sha256: str | None
+    software_version: str
+    settings: Details = {}
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class RunResult:
+    """Everything that processing one run gave.
+
+    Attributes
+    ----------
+    manifest : RunManifest
+    led_names : tuple of str
+        In the layout's order, as the second axis of the LED arrays.
+    observations : LedObservations
+    optical : OpticalTrack
+    fused : dict
+        A `FusedTrack` for each of ``"imu"`` (sensor slots), ``"frame"`` and ``"edge"`` (square wave) that
+        was made; empty if the fusion could not run.
+    edge_index : ndarray of int64, shape (n,)
+        Number of the rising edge of each row of ``fused["edge"]``.
+    edge_fit : EdgeFit or None
+    imu : ImuTrack or None
+        The samples that the fusion used, brick axes.
+    rest : RestPose or None
+        `None`: nothing was quiet; displacements from rest are NaN.
+    alignment : dict
+        What the time alignment found, as ``offset_ms``, ``offset_sd_ms``, ``skew_ppm``, ``method``.
+    calibration : dict
+        What to know of the calibration, as ``method``, ``rms_um``, ``date``, ``camera``.
+    problems : tuple of str
+        In words, the gravest first.
+    timings_s : dict
+        Wall time of each stage; kept apart from the numbers.
+    """
+
+    manifest: RunManifest
+    led_names: tuple[str, ...]
+    observations: LedObservations
+    optical: OpticalTrack
+    fused: dict[FusedKind, FusedTrack]
+    edge_index: IntArray
+    edge_fit: EdgeFit | None
+    imu: ImuTrack | None
+    rest: RestPose | None
+    alignment: Details
+    calibration: Details
+    problems: tuple[str, ...]
+    provenance: Provenance
+    timings_s: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def t0_ns(self) -> int | None:
+        """Return the trigger, CLOCK_MONOTONIC of the unit; `None` if none came."""
+        return self.manifest.trigger.t0_ns
+
+
+class _RestEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    rotation_camera_rest: list[list[float]]
+    position_camera_mm: list[float]
+    interval_ns: tuple[int, int]
+    n_frames: int
+    spread_mm: list[float]
+    spread_rad: list[float]
+    source: Literal["found", "given"]
+
+
+class _Summary(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    schema: str = RESULTS_SCHEMA
+    version: int = RESULTS_VERSION
+    run_id: str
+    unit: str
+    simulated: bool
+    problems: list[str]
+    led_names: list[str]
+    conventions: dict[str, str]
+    tables: dict[str, int]
+    rest_pose: _RestEntry | None
+    square_wave: Details | None
+    alignment: Details
+    calibration: Details
+    acc_range_mps2: float | None
+    provenance: Provenance
+    manifest: RunManifest
+
+
+def software_version() -> str:
+    """Return the installed version of bricktrack."""
+    return importlib.metadata.version("bricktrack")
+
+
+def write_results(result: RunResult, folder: Path) -> None:
+    """Write a run's results, replacing a folder of an earlier processing.
+
+    Everything is written beside the folder first, synced, and then renamed: a kill at any moment leaves
+    the old results, or none, or the new ones, never a part.
+
+    Parameters
+    ----------
+    result : RunResult
+    folder : Path
+        As ``<run folder>/results``.
+
+    Raises
+    ------
+    StorageError
+        If the folder exists and holds something else than results, or cannot be written.
+    """
+    partial = folder.with_name(f".{folder.name}.partial")
+    previous = folder.with_name(f".{folder.name}.previous")
+    if folder.exists() and not (folder / SUMMARY_NAME).is_file():
+        raise StorageError(f"{folder} exists and holds no bricktrack results; it is left alone. Move it away")
+    try:
+        for leftover in (partial, previous):
+            if leftover.exists():
+                shutil.rmtree(leftover)
+        partial.mkdir(parents=True)
+        _write_files(result, partial)
+        for path in sorted(partial.iterdir()):
+            sync_file(path)
+        sync_folder(partial)
+        if folder.exists():
+            folder.rename(previous)
+        partial.rename(folder)
+        sync_folder(folder.parent)
+        if previous.exists():
+            shutil.rmtree(previous)
+    except OSError as e:
+        raise StorageError(f"{folder}: results cannot be written: {e.strerror or e}") from e
+
+
+def _write_files(result: RunResult, folder: Path) -> None:
+    t0_ns = result.t0_ns
+    metadata = _table_metadata(result)
+    tables: dict[str, Any] = {
+        "optical": optical_table(
+            result.optical,
+            result.observations,
+            t0_ns=t0_ns,
+            rest=result.rest,
+            edge_fit=result.edge_fit,
+            metadata=metadata,
+        ),
+        "fused": fused_table(
+            result.fused,
+            edge_index=result.edge_index,
+            t0_ns=t0_ns,
+            rest=result.rest,
+            edge_fit=result.edge_fit,
+            metadata=metadata,
+        ),
+        "leds": leds_table(
+            result.observations, result.optical, result.led_names, t0_ns=t0_ns, metadata=metadata
+        ),
+    }
+    if result.imu is not None:
+        tables["imu"] = imu_table(result.imu, t0_ns=t0_ns, metadata=metadata)
+    if result.edge_fit is not None:
+        tables["edges"] = edges_table(result.edge_fit, t0_ns=t0_ns, metadata=metadata)
+    for name, table in tables.items():
+        pa.parquet.write_table(table, folder / f"{name}.parquet", compression="zstd")
+        flat = table.drop_columns(["covariance"]) if "covariance" in table.column_names else table
+        pa.csv.write_csv(flat, folder / f"{name}.csv", pa.csv.WriteOptions(quoting_style="needed"))
+    summary = _Summary(
+        run_id=result.manifest.run_id,
+        unit=result.manifest.unit,
+        simulated=result.manifest.simulated,
+        problems=list(result.problems),
+        led_names=list(result.led_names),
+        conventions=CONVENTIONS,
+        tables={name: table.num_rows for name, table in tables.items()},
+        rest_pose=_rest_entry(result.rest),
+        square_wave=_square_wave(result.edge_fit),
+        alignment=result.alignment,
+        calibration=result.calibration,
+        acc_range_mps2=None if result.imu is None else result.imu.acc_range_mps2,
+        provenance=result.provenance,
+        manifest=result.manifest,
+    )
+    (folder / SUMMARY_NAME).write_bytes(dump_json(summary))
+    (folder / TIMINGS_NAME).write_bytes(dump_json(result.timings_s))
+
+
+def read_result(folder: Path) -> RunResult:
+    """Return the results that `write_results` wrote.
+
+    Raises
+    ------
+    RunFormatError
+        If the folder holds no results, is of a newer version, or a table is missing or damaged.
+    """
+    path = folder / SUMMARY_NAME
+    if not path.is_file():
+        raise RunFormatError(f"{folder}: no {SUMMARY_NAME}; this is no results folder. Process the run first")
+    head = load_json(path, dict[str, Any])
+    if head.get("schema") != RESULTS_SCHEMA or not isinstance(head.get("version"), int):
+        raise RunFormatError(f"{path}: not a {RESULTS_SCHEMA} summary")
+    if head["version"] > RESULTS_VERSION:
+        raise RunFormatError(
+            f"{path}: {RESULTS_SCHEMA} version {head['version']}; this bricktrack reads up to version "
+            f"{RESULTS_VERSION}. Upgrade bricktrack on this machine"
+        )
+    summary = load_json(path, _Summary)
+    tables = {name: _read_table(folder / f"{name}.parquet", rows) for name, rows in summary.tables.items()}
+    for name in ("optical", "fused", "leds"):
+        if name not in tables:
+            raise RunFormatError(f"{path}: tables: no '{name}'")
+    optical, observations = optical_from_tables(tables["optical"], tables["leds"], len(summary.led_names))
+    fused, edge_index = fused_from_table(tables["fused"])
+    imu = None
+    if "imu" in tables:
+        imu = imu_from_table(
+            tables["imu"], np.nan if summary.acc_range_mps2 is None else summary.acc_range_mps2
+        )
+    edge_fit = None
+    if "edges" in tables:
+        nominal_hz = summary.manifest.trigger.nominal_hz
+        edge_fit = fit_edges(tables["edges"].column("t_ns").to_numpy(), nominal_hz)
+    timings = folder / TIMINGS_NAME
+    return RunResult(
+        manifest=summary.manifest,
+        led_names=tuple(summary.led_names),
+        observations=observations,
+        optical=optical,
+        fused=fused,
+        edge_index=edge_index,
+        edge_fit=edge_fit,
+        imu=imu,
+        rest=_rest_pose(summary.rest_pose),
+        alignment=summary.alignment,
+        calibration=summary.calibration,
+        problems=tuple(summary.problems),
+        provenance=summary.provenance,
+        timings_s=load_json(timings, dict[str, float]) if timings.is_file() else {},
+    )
+
+
+def _read_table(path: Path, n_rows: int) -> Any:
+    try:
+        table = pa.parquet.read_table(path)
+    except FileNotFoundError as e:
+        raise RunFormatError(f"{path}: missing. Process the run again") from e
+    except (OSError, pa.ArrowException) as e:
+        raise RunFormatError(f"{path}: not a readable Parquet table: {e}") from e
+    if table.num_rows != n_rows:
+        raise RunFormatError(f"{path}: {table.num_rows} rows; the summary says {n_rows}")
+    return table
+
+
+def _table_metadata(result: RunResult) -> dict[str, str]:
+    metadata = {f"bricktrack.{name.replace(' ', '_')}": words for name, words in CONVENTIONS.items()}
+    metadata |= {
+        "bricktrack.schema": RESULTS_SCHEMA,
+        "bricktrack.version": str(RESULTS_VERSION),
+        "bricktrack.run_id": result.manifest.run_id,
+        "bricktrack.unit": result.manifest.unit,
+        "bricktrack.simulated": "true" if result.manifest.simulated else "false",
+        "bricktrack.trigger_ns": "none" if result.t0_ns is None else str(result.t0_ns),
+        "bricktrack.rest_pose": msgspec.json.encode(_rest_entry(result.rest)).decode(),
+        "bricktrack.provenance": msgspec.json.encode(result.provenance).decode(),
+    }
+    return metadata
+
+
+def _rest_entry(rest: RestPose | None) -> _RestEntry | None:
+    if rest is None:
+        return None
+    return _RestEntry(
+        rotation_camera_rest=rest.R_camera_rest.tolist(),
+        position_camera_mm=rest.t_camera_rest_mm.tolist(),
+        interval_ns=rest.interval_ns,
+        n_frames=rest.n_frames,
+        spread_mm=rest.spread_mm.tolist(),
+        spread_rad=rest.spread_rad.tolist(),
+        source=rest.source,
+    )
+
+
+def _rest_pose(entry: _RestEntry | None) -> RestPose | None:
+    if entry is None:
+        return None
+    return RestPose(
+        R_camera_rest=np.array(entry.rotation_camera_rest),
+        t_camera_rest_mm=np.array(entry.position_camera_mm),
+        interval_ns=entry.interval_ns,
+        n_frames=entry.n_frames,
+        spread_mm=np.array(entry.spread_mm),
+        spread_rad=np.array(entry.spread_rad),
+        source=entry.source,
+    )
+
+
+def _square_wave(fit: EdgeFit | None) -> Details | None:
+    if fit is None:
+        return None
+    return {
+        "edges": fit.n_edges,
+        "edges_missed": int(fit.missed_index.size),
+        "edges_extra": int(np.count_nonzero(fit.is_extra)),
+        "nominal_hz": fit.nominal_hz,
+        "period_ns": fit.period_ns,
+        "period_sd_ns": fit.period_sd_ns,
+        "t0_ns": fit.t0_ns,
+        "t0_fraction_ns": fit.t0_fraction_ns,
+        "t0_sd_ns": fit.t0_sd_ns,
+        "rate_ppm": fit.rate_ppm,
+        "rate_sd_ppm": fit.rate_sd_ppm,
+        "residual_rms_ns": fit.residual_rms_ns,
+        "residual_max_ns": fit.residual_max_ns,
+    }

@@ -1,0 +1,333 @@
+"""How far results are from the truth of a simulated run: errors, and whether the covariances are honest."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+import numpy as np
+from rich import box
+from rich.table import Table
+from scipy.stats import chi2
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.errors import TrackingError
+from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.results.rest_pose import RestPose
+from bricktrack_host.results.result_store import RunResult
+from bricktrack_host.results.true_motion import TrueMotion
+from bricktrack_host.tracks import FusedTrack, OpticalTrack
+
+IMPACT_MPS2 = 30.0  # about 3 g: above the strongest shaking of the table, below the weakest impact
+NEAR_IMPACT_NS = 50_000_000
+_CHI2_95 = float(chi2.ppf(0.95, 6))
+
+Source = Literal["optical", "fused"]
+COMPONENTS = ("x", "y", "z", "rot x", "rot y", "rot z")
+
+
+class GroupErrors(msgspec.Struct, frozen=True, kw_only=True):
+    """Errors of one track over one group of instants.
+
+    Attributes
+    ----------
+    source : "optical" or "fused"
+    group : str
+        Which instants, in words.
+    n : int
+        Instants compared.
+    n_without : int
+        Instants of the group with a truth but without a pose, or the reverse.
+    rms, largest, mean : list of float
+        x, y, z in mm (camera axes), then the rotation error in degrees (brick axes): root mean square,
+        largest magnitude, mean. NaN (null in JSON) where nothing could be compared.
+    nees_mean : float
+        Mean normalised error squared over its 6 degrees of freedom: 1 if the covariances are honest,
+        larger if they promise too much.
+    nees_within_95 : float
+        Share of instants within the 95 % region of their covariance.
+    """
+
+    source: Source
+    group: str
+    n: int
+    n_without: int
+    rms: list[float]
+    largest: list[float]
+    mean: list[float]
+    nees_mean: float
+    nees_within_95: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorSeries:
+    """Errors of one track over time.
+
+    Attributes
+    ----------
+    t_ns : ndarray of int64, shape (n,)
+    error : ndarray, shape (n, 6)
+        Estimate less truth: x, y, z, mm, camera axes; rotation vector of R_true^T R_est, deg, brick axes.
+    sd : ndarray, shape (n, 6)
+        What the covariance promises, same units.
+    """
+
+    t_ns: IntArray
+    error: FloatArray
+    sd: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthComparison:
+    """A run against its truth.
+
+    Attributes
+    ----------
+    groups : list of GroupErrors
+        In camera axes with nothing zeroed.
+    from_rest : list of GroupErrors
+        The same instants as displacements from rest, x, y, z in brick axes at rest: constant errors are gone.
+        Empty where the run has no rest pose. Their normalised errors are NaN.
+    series : dict
+        `ErrorSeries` of ``"optical"`` and ``"fused"`` (at inertial slots, or frames if there are none).
+    impacts_ns : ndarray of int64, shape (k,)
+        When the true acceleration first passed 30 m/s^2, for each impact.
+    """
+
+    groups: list[GroupErrors]
+    from_rest: list[GroupErrors]
+    series: dict[Source, ErrorSeries]
+    impacts_ns: IntArray
+
+    def to_json(self) -> bytes:
+        """Return the figures as indented JSON; NaN becomes null."""
+        data = {
+            "schema": "bricktrack.truth-comparison",
+            "version": 1,
+            "simulated": True,
+            "components": ["x_mm", "y_mm", "z_mm", "rot_x_deg", "rot_y_deg", "rot_z_deg"],
+            "camera_frame": self.groups,
+            "from_rest": self.from_rest,
+            "impacts_ns": self.impacts_ns.tolist(),
+        }
+        return msgspec.json.format(msgspec.json.encode(data), indent=2) + b"\n"
+
+
+def compare_with_truth(result: RunResult, truth: TrueMotion) -> TruthComparison:
+    """Return the errors of a run's optical and fused poses against its true motion.
+
+    Instants fall in one group each: during dropouts (the truth's, and what the fusion flagged as such),
+    within 50 ms of an impact, at frames, and between frames; "all" joins the four. What was extrapolated
+    beyond the first or last optical pose stands apart and is not in "all".
+
+    Raises
+    ------
+    TrackingError
+        If no instant of the run has a truth: another run's file, or another clock.
+    """
+    shift_ns = 0
+    if truth.is_relative:
+        # Such a file counts from the first stamp; poses hold at the instant of the frame's own pose.
+        if not len(result.optical.t_ns):
+            raise TrackingError("a run without frames cannot be laid over a truth that counts from the first")
+        shift_ns = int(result.optical.t_ns[0] - truth.t_ns[0])
+    impacts_ns = _impacts(truth) + shift_ns
+    dropouts_ns = truth.dropouts_ns + shift_ns
+    groups: list[GroupErrors] = []
+    from_rest: list[GroupErrors] = []
+    series: dict[Source, ErrorSeries] = {}
+    true_rest = None
+    if result.rest is not None:
+        middle = np.array([sum(result.rest.interval_ns) // 2], dtype=np.int64)
+        R_rest, t_rest_mm = truth.at(_snap(middle, result.optical.t_ns) - shift_ns)
+        if np.isfinite(t_rest_mm).all():
+            true_rest = R_rest[0], t_rest_mm[0]
+
+    def compare(source: Source, tracks: dict[str, OpticalTrack | FusedTrack], shown: str) -> None:
+        parts = {kind: _Errors.of(track, truth, shift_ns) for kind, track in tracks.items()}
+        series[source] = ErrorSeries(tracks[shown].t_ns, parts[shown].error, parts[shown].sd)
+        masks = {k: _group_masks(tracks[k], k, dropouts_ns, impacts_ns) for k in tracks}
+        names = dict.fromkeys(name for m in masks.values() for name in m)
+        zeroed = {}
+        if result.rest is not None and true_rest is not None:
+            zeroed = {k: _rest_errors(t, truth, result.rest, true_rest, shift_ns) for k, t in tracks.items()}
+        for name in names:
+            chosen = [(k, masks[k][name]) for k in tracks if name in masks[k]]
+            if not any(mask.any() for _, mask in chosen):
+                continue
+            groups.append(_summarise(source, name, [parts[k].select(m) for k, m in chosen]))
+            if zeroed:
+                from_rest.append(_summarise(source, name, [zeroed[k].select(m) for k, m in chosen]))
+
+    compare("optical", {"frame": result.optical}, "frame")
+    if result.fused:
+        tracks: dict[str, OpticalTrack | FusedTrack] = dict(result.fused.items())
+        compare("fused", tracks, "imu" if "imu" in tracks else next(iter(tracks)))
+    if not any(g.n for g in groups):
+        raise TrackingError(
+            f"the truth covers {truth.t_ns[0]}..{truth.t_ns[-1]} ns and no pose of run "
+            f"{result.manifest.run_id} lies there: it belongs to another run, or to another clock"
+        )
+    return TruthComparison(groups, from_rest, series, impacts_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Errors:
+    """Errors, promised deviations and normalised errors of a track; rows as the track."""
+
+    error: FloatArray
+    sd: FloatArray
+    nees: FloatArray
+    has_truth: BoolArray
+    has_pose: BoolArray
+
+    @classmethod
+    def of(cls, track: OpticalTrack | FusedTrack, truth: TrueMotion, shift_ns: int) -> "_Errors":
+        R_true, t_true_mm = truth.at(track.t_ns - shift_ns)
+        shift_mm = track.t_camera_brick_mm - t_true_mm
+        turn_rad = rvec_from_matrix(np.swapaxes(R_true, -1, -2) @ track.R_camera_brick)
+        # The covariance is of [dtheta, dt] with R_true = R Exp(dtheta): minus this error, same size.
+        raw = np.concatenate([turn_rad, shift_mm], axis=1)
+        sd = np.sqrt(np.diagonal(track.covariance, axis1=1, axis2=2))
+        return cls(
+            error=np.concatenate([shift_mm, np.rad2deg(turn_rad)], axis=1),
+            sd=np.concatenate([sd[:, 3:], np.rad2deg(sd[:, :3])], axis=1),
+            nees=_normalised(raw, track.covariance),
+            has_truth=_known(t_true_mm),
+            has_pose=_known(track.t_camera_brick_mm),
+        )
+
+    def select(self, mask: BoolArray) -> "_Errors":
+        return _Errors(
+            self.error[mask], self.sd[mask], self.nees[mask], self.has_truth[mask], self.has_pose[mask]
+        )
+
+
+def _rest_errors(
+    track: OpticalTrack | FusedTrack,
+    truth: TrueMotion,
+    rest: RestPose,
+    true_rest: tuple[FloatArray, FloatArray],
+    shift_ns: int,
+) -> _Errors:
+    """Return the errors of displacements from rest, each seen from its own rest pose."""
+    R_true, t_true_mm = truth.at(track.t_ns - shift_ns)
+    moved_mm = (track.t_camera_brick_mm - rest.t_camera_rest_mm) @ rest.R_camera_rest
+    true_moved_mm = (t_true_mm - true_rest[1]) @ true_rest[0]
+    turned = rest.R_camera_rest.T @ track.R_camera_brick
+    true_turned = true_rest[0].T @ R_true
+    turn_rad = rvec_from_matrix(np.swapaxes(true_turned, -1, -2) @ turned)
+    nothing = np.full((len(track.t_ns), 6), np.nan)
+    return _Errors(
+        error=np.concatenate([moved_mm - true_moved_mm, np.rad2deg(turn_rad)], axis=1),
+        sd=nothing,
+        nees=nothing[:, 0],
+        has_truth=_known(t_true_mm),
+        has_pose=_known(track.t_camera_brick_mm),
+    )
+
+
+def _known(vectors: FloatArray) -> BoolArray:
+    return np.asarray(np.isfinite(vectors).all(axis=1))
+
+
+def _normalised(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return ``e^T C^-1 e``; NaN where an error or covariance is not known or the covariance is singular."""
+    out = np.full(len(error), np.nan)
+    known = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    known &= (scale > 0).all(axis=1)
+    if known.any():
+        e = error[known] / scale[known]  # mm and rad differ by orders: correlations are well conditioned
+        C = covariance[known] / (scale[known][:, :, None] * scale[known][:, None, :])
+        regular = np.linalg.eigvalsh(C)[:, 0] > 1e-9
+        rows = np.flatnonzero(known)[regular]
+        solved = np.linalg.solve(C[regular], e[regular][..., None])[..., 0]
+        out[rows] = np.sum(e[regular] * solved, axis=1)
+    return out
+
+
+def _group_masks(
+    track: OpticalTrack | FusedTrack, kind: str, dropouts_ns: IntArray, impacts_ns: IntArray
+) -> dict[str, BoolArray]:
+    t_ns = track.t_ns
+    outside = track.flags & int(PoseFlag.EXTRAPOLATED) != 0
+    dropout = track.flags & int(PoseFlag.DROPOUT) != 0
+    for first, last in dropouts_ns:
+        dropout |= (t_ns >= first) & (t_ns <= last)
+    impact = np.zeros(len(t_ns), dtype=np.bool_)
+    for t_impact in impacts_ns:
+        impact |= np.abs(t_ns - t_impact) <= NEAR_IMPACT_NS
+    calm = ~outside & ~dropout & ~impact
+    nowhere = np.zeros(len(t_ns), dtype=np.bool_)
+    return {
+        "all": ~outside,
+        "at frames": calm if kind == "frame" else nowhere,
+        "between frames": nowhere if kind == "frame" else calm,
+        "during dropouts": dropout & ~outside,
+        "near impacts": impact & ~dropout & ~outside,
+        "extrapolated": outside,
+    }
+
+
+def _summarise(source: Source, group: str, parts: list[_Errors]) -> GroupErrors:
+    error = np.concatenate([p.error for p in parts])
+    nees = np.concatenate([p.nees for p in parts])
+    both = np.concatenate([p.has_truth & p.has_pose for p in parts])
+    error = error[both]
+    nees = nees[both]
+    nees = nees[np.isfinite(nees)]
+    nothing = [float("nan")] * 6
+    return GroupErrors(
+        source=source,
+        group=group,
+        n=int(both.sum()),
+        n_without=int((~both).sum()),
+        rms=np.sqrt(np.mean(error**2, axis=0)).tolist() if len(error) else nothing,
+        largest=np.abs(error).max(axis=0).tolist() if len(error) else nothing,
+        mean=error.mean(axis=0).tolist() if len(error) else nothing,
+        nees_mean=float(nees.mean() / 6) if nees.size else float("nan"),
+        nees_within_95=float(np.mean(nees <= _CHI2_95)) if nees.size else float("nan"),
+    )
+
+
+def _impacts(truth: TrueMotion) -> IntArray:
+    """Return when the true acceleration passes the limit, one instant for each 50 ms."""
+    if not truth.is_continuous:
+        return np.empty(0, dtype=np.int64)
+    seconds = (np.diff(truth.t_ns) / 1e9)[:, None]
+    acc_mps2 = np.linalg.norm(np.diff(truth.v_camera_mmps, axis=0) / seconds, axis=1) / 1000
+    found: list[int] = []
+    for t_ns in truth.t_ns[1:][acc_mps2 > IMPACT_MPS2].tolist():
+        if not found or t_ns - found[-1] > NEAR_IMPACT_NS:
+            found.append(t_ns)
+    return np.array(found, dtype=np.int64)
+
+
+def _snap(t_ns: IntArray, frames_ns: IntArray) -> IntArray:
+    """Return the frame instants nearest to times: truths of single frames have no other."""
+    return np.asarray(frames_ns[np.abs(frames_ns[None, :] - t_ns[:, None]).argmin(axis=1)])
+
+
+def comparison_table(comparison: TruthComparison, *, from_rest: bool = False) -> Table:
+    """Return the figures as a table for the terminal: root mean squares, below them largest magnitudes."""
+    what = "displacements from rest, brick axes" if from_rest else "camera axes, nothing zeroed"
+    table = Table(
+        title=f"Errors against simulated truth: {what}",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("rms; below: largest", no_wrap=True)
+    table.add_column("n", justify="right")
+    for name in COMPONENTS:
+        unit = "deg" if name.startswith("rot") else "mm"
+        table.add_column(f"{name.replace('rot ', 'r')} {unit}", justify="right")
+    if not from_rest:
+        table.add_column("95 %", justify="right")
+    for g in comparison.from_rest if from_rest else comparison.groups:
+        if g.n:
+            honest = [] if from_rest else [f"{100 * g.nees_within_95:.0f} %"]
+            table.add_row(f"{g.source}, {g.group}", str(g.n), *(f"{x:.3f}" for x in g.rms), *honest)
+            table.add_row("", "", *(f"{x:.3f}" for x in g.largest), style="dim")
+    return table

@@ -1,0 +1,1 @@
+"""From pictures to optical poses: lights, identities, PRSOI and its refinement."""

@@ -1,0 +1,213 @@
+"""From the pictures of a run to identified centroids.
+
+Each picture is searched decimated, which is cheap and blind to no motion, and every find of an LED's size
+is measured at full resolution; no picture is kept. Then the run is identified (`led_identity`), and the
+areas are compared with what each LED shows in the rest of the run: LEDs partly covered, or run together with
+another light, are flagged.
+"""
+
+import logging
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.errors import TrackingError
+from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.tracking.correspondence import MIN_INLIERS
+from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.led_identity import Identities, SegmentMethod, identify_run
+from bricktrack_host.tracking.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.segment import Blobs, PaperLimits, Picture, find_blobs, paper_filter
+from bricktrack_host.tracks import LedObservations
+
+logger = logging.getLogger(__name__)
+
+_AREA_SIGMAS = 6.0
+_AREA_FLOOR = 0.015  # a dome behind an edge that hides this share of it moves its centroid by some 0.7 px
+_BLUR_COV_SHARE = 0.03
+"""Error of mid-exposure, as a share of the length of the smear: the motion is not uniform during exposure."""
+NOT_USED = LedFlag.MISSING | LedFlag.BORDER | LedFlag.PARTLY_COVERED | LedFlag.MERGED
+
+
+def observe_leds(
+    pictures: Iterable[tuple[int, Picture]],
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    sensor_timestamp_ns: ArrayLike,
+    exposure_ns: ArrayLike,
+    method: SegmentMethod = "default",
+    progress: Callable[[int], None] | None = None,
+) -> LedObservations:
+    """Find, identify and measure the LEDs in all pictures of a run.
+
+    Parameters
+    ----------
+    pictures : iterable of (int, Picture)
+        Index of the frame and its picture, in time order; a picture is not kept. Frames that do not come are
+        flagged `PoseFlag.FRAME_LOST`.
+    ray_model : RayModel
+    brick_model : BrickModel
+    sensor_timestamp_ns, exposure_ns : array_like of int64, shape (n_frames,)
+    method : "default" or "paper"
+        The paper's filter and, for its layout, its rules of identity; or ours.
+    progress : callable, optional
+        Called with the number of frames done.
+
+    Returns
+    -------
+    LedObservations
+        Frames without an identity have NaN and `PoseFlag.NO_POSE`, ambiguous ones `PoseFlag.AMBIGUOUS`.
+
+    Raises
+    ------
+    TrackingError
+        If the times do not fit each other, a picture's index is outside them or out of order, or its size is
+        not that of the calibration.
+    """
+    stamps = np.asarray(sensor_timestamp_ns, dtype=np.int64)
+    exposure = np.asarray(exposure_ns, dtype=np.int64)
+    if stamps.ndim != 1 or stamps.shape != exposure.shape:
+        raise TrackingError(
+            f"sensor time stamps have shape {stamps.shape}, exposures {exposure.shape}; expected one of each "
+            "a frame"
+        )
+    if method not in ("default", "paper"):
+        raise TrackingError(f"segmentation method is {method!r}; expected 'default' or 'paper'")
+    n, n_leds = len(stamps), brick_model.n_leds
+    out = LedObservations(
+        sensor_timestamp_ns=stamps,
+        exposure_ns=exposure,
+        uv_px=np.full((n, n_leds, 2), np.nan),
+        cov_px2=np.full((n, n_leds, 2, 2), np.nan),
+        area_px2=np.full((n, n_leds), np.nan),
+        led_flags=np.full((n, n_leds), int(LedFlag.MISSING), dtype=np.int64),
+        frame_flags=np.full(n, int(PoseFlag.FRAME_LOST | PoseFlag.NO_POSE), dtype=np.int64),
+    )
+    radius_px = usual_radius_px(ray_model, brick_model)
+    limits = PaperLimits.for_radius(radius_px)
+    lights: list[Blobs | None] = [None] * n
+    mode = ray_model.sensor_mode
+    last = -1
+    for done, (i, picture) in enumerate(pictures, start=1):
+        if not last < i < n:
+            raise TrackingError(
+                f"picture of frame {i} after frame {last}, with {n} time stamps; expected rising indices "
+                "below their number"
+            )
+        if picture.luma.shape != (mode.height, mode.width):
+            raise TrackingError(
+                f"frame {i} has {picture.luma.shape[1]} x {picture.luma.shape[0]} pixels; the calibration is "
+                f"of mode {mode.name}, {mode.width} x {mode.height}. Use the calibration of the run's mode."
+            )
+        last = i
+        lights[i] = (
+            paper_filter(picture, limits=limits)
+            if method == "paper"
+            else find_blobs(picture, radius_px=radius_px)
+        )
+        if progress is not None:
+            progress(done)
+    found = identify_run(
+        lights,
+        stamps,
+        ray_model,
+        brick_model,
+        radius_px=radius_px,
+        collar_mm=collar_of(brick_model),
+        method=method,
+    )
+    for i, blobs in enumerate(lights):
+        if blobs is None:
+            continue
+        out.frame_flags[i] = _frame_flags(found, i)
+        leds = np.flatnonzero(found.blob_of_led[i] >= 0)
+        index = found.blob_of_led[i, leds]
+        out.uv_px[i, leds] = blobs.uv_px[index]
+        out.cov_px2[i, leds] = blobs.cov_px2[index]
+        out.area_px2[i, leds] = blobs.area_px2[index]
+        out.led_flags[i, leds] = blobs.flags[index]
+    R, t = found.R_camera_brick, found.t_camera_brick_mm
+    _flag_areas(out, R, t, ray_model, brick_model)
+    _widen_blurred(out)
+    seen = all_finite(out.uv_px)
+    covered = np.zeros(seen.shape, dtype=bool)
+    covered[seen] = ray_model.is_covered(out.uv_px[seen])
+    out.led_flags[seen & ~covered] |= LedFlag.UNCOVERED
+    n_lost = int(((out.frame_flags & PoseFlag.NO_POSE) != 0).sum())
+    if n_lost:
+        logger.warning("%d of %d frames without identified LEDs", n_lost, n)
+    return out
+
+
+def _frame_flags(found: Identities, i: int) -> int:
+    n_found = int((found.blob_of_led[i] >= 0).sum())
+    if n_found == 0:
+        ambiguous = PoseFlag.AMBIGUOUS if found.is_ambiguous[i] else PoseFlag.NONE
+        return int(PoseFlag.NO_POSE | ambiguous)
+    flags = PoseFlag.NONE if n_found == found.blob_of_led.shape[1] else PoseFlag.LED_MISSING
+    return int(flags | PoseFlag.UNVERIFIED if n_found == MIN_INLIERS else flags)
+
+
+def usual_radius_px(ray_model: RayModel, brick_model: BrickModel) -> float:
+    """Return the radius of an LED midway between the calibrated planes, at the picture's middle, px."""
+    mode = ray_model.sensor_mode
+    z = 0.5 * (ray_model.plane_a_mm + ray_model.plane_b_mm)
+    middle = np.array([0.5 * (mode.width - 1), 0.5 * (mode.height - 1)])
+    xy = ray_model.points_on_plane(middle, z)
+    J = ray_model.project(np.array([xy[0], xy[1], z])).J_px_per_mm[:, :2]
+    return float(np.median(brick_model.led_radii_mm) * np.sqrt(abs(np.linalg.det(J))))
+
+
+def _flag_areas(
+    out: LedObservations, R: FloatArray, t: FloatArray, ray_model: RayModel, brick_model: BrickModel
+) -> None:
+    """Flag LEDs whose area is not what they show in the rest of the run, given the pose."""
+    posed = np.flatnonzero(all_finite(R, 2))
+    if posed.size == 0:
+        return
+    # Bare profile where none was fitted: the ratio to the run's median takes the difference off.
+    prediction, _ = predict_brick(
+        R[posed], t[posed], ray_model, brick_model, collar_mm=collar_of(brick_model) or 0.0
+    )
+    ratio = np.log(out.area_px2[posed] / prediction.area_px2)
+    usable = np.isfinite(ratio) & ((out.led_flags[posed] & NOT_USED) == 0)
+    usual = _median_or_nan(ratio, usable)
+    usual_of_all = float(np.nanmedian(usual)) if np.isfinite(usual).any() else 0.0
+    # An LED covered in most of the run would set its own standard: then the others' holds.
+    strange = ~(np.abs(usual - usual_of_all) < 0.15)
+    usual = np.where(strange, usual_of_all, usual)
+    deviation = ratio - usual
+    spread = 1.4826 * np.median(np.abs(deviation[usable])) if usable.any() else 0.0
+    limit = max(_AREA_SIGMAS * spread, _AREA_FLOOR)
+    flags = out.led_flags[posed]
+    with np.errstate(invalid="ignore"):
+        flags[deviation < -limit] |= LedFlag.PARTLY_COVERED
+        flags[deviation > 2 * limit] |= LedFlag.MERGED
+    out.led_flags[posed] = flags
+
+
+def _median_or_nan(values: FloatArray, usable: BoolArray) -> FloatArray:
+    return np.array([np.median(v[u]) if u.any() else np.nan for v, u in zip(values.T, usable.T, strict=True)])
+
+
+def _widen_blurred(out: LedObservations) -> None:
+    """Flag centroids smeared by more than their radius, and widen all along their smear."""
+    seconds = (out.sensor_timestamp_ns - out.sensor_timestamp_ns[0]) * 1e-9 if len(out.uv_px) else np.zeros(0)
+    if len(seconds) < 2:
+        return
+    step = np.diff(seconds)
+    speed = np.diff(out.uv_px, axis=0) / np.where((step > 0) & (step < 0.1), step, np.nan)[:, None, None]
+    before = np.concatenate([np.full_like(speed[:1], np.nan), speed])
+    after = np.concatenate([speed, np.full_like(speed[:1], np.nan)])
+    faster = np.nan_to_num(np.linalg.norm(after, axis=-1)) > np.nan_to_num(np.linalg.norm(before, axis=-1))
+    velocity = np.nan_to_num(np.where(faster[..., None], after, before))
+    smear = velocity * (out.exposure_ns * 1e-9)[:, None, None]
+    out.cov_px2[:] += _BLUR_COV_SHARE**2 * smear[..., :, None] * smear[..., None, :]
+    with np.errstate(invalid="ignore"):
+        blurred = np.linalg.norm(smear, axis=-1) > np.sqrt(out.area_px2 / np.pi)
+    out.led_flags[blurred] |= LedFlag.BLURRED

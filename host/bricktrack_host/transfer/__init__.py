@@ -1,0 +1,1 @@
+"""Talking to the units and bringing their runs over, verified."""
