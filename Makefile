@@ -4,10 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test check bench docs format constraints clean help
+.PHONY: demo test test-virtual-camera check bench docs format constraints clean help
 
 help:  ## show this list
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 24
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -23,6 +23,9 @@ demo: $(READY)  ## record a simulated brick with the real daemon, pull it, proce
 
 test: $(READY)  ## all tests
 	$(BIN)/python -m pytest
+
+test-virtual-camera: $(READY)  ## the picamera2 adapter under the real libraries, on the virtual Pi
+	tests/virtual_pi/run_camera.sh
 
 check: $(READY)  ## formatting, lint, import contracts, types, documentation
 	$(BIN)/ruff format --check .

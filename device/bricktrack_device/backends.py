@@ -8,6 +8,11 @@ from bricktrack_device.interfaces import Rig
 
 
 def _open_sim(config: DeviceConfig) -> Rig:
+    if config.camera.mode != "1080p-crop" or config.camera.qp is not None:
+        raise ConfigError(
+            f"camera: mode = {config.camera.mode!r}, qp = {config.camera.qp!r}: the simulated camera has "
+            "'1080p-crop' and a bit rate only; leave both out for backend 'sim'"
+        )
     try:
         from bricktrack_device.sim.sim_rig import SimRig
     except ModuleNotFoundError as e:

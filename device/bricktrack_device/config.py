@@ -16,6 +16,7 @@ from bricktrack_device.sim.settings import SimSettings
 
 ImuMode = Literal["amg", "accgyro", "imuplus", "ndof"]
 Pull = Literal["down", "up", "none"]
+CameraModeName = Literal["1080p-crop", "full-field"]
 
 _NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9-]{0,31}$"
 _US_PER_S = 1e6
@@ -48,11 +49,14 @@ class ServerTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class CameraTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``[camera]``: fixed exposure, gains and encoder; automatic control is off.
 
-    With ``required = true`` a unit whose camera does not start refuses to arm; with ``false`` it arms
-    and the run says that the video is missing.
+    ``mode`` is "1080p-crop" (the sensor's centre at full sampling) or "full-field" (all of it, binned by
+    two); a calibration belongs to one of them. ``qp`` fixes the encoder's quantiser instead of the bit rate. With
+    ``required = true`` a unit whose camera does not start refuses to arm; with ``false`` it arms and the run
+    says that the video is missing.
     """
 
     required: bool = True
+    mode: CameraModeName = "1080p-crop"
     exposure_us: Annotated[int, msgspec.Meta(ge=75, le=33_000)] = 2000
     analogue_gain: Annotated[float, msgspec.Meta(ge=1.0, le=16.0)] = 1.0
     colour_gains: tuple[
@@ -61,6 +65,7 @@ class CameraTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True)
     frame_rate_hz: Annotated[float, msgspec.Meta(gt=0, le=240)] = 30.0
     bitrate_bps: Annotated[int, msgspec.Meta(ge=25_000, le=25_000_000)] = 12_000_000
     iperiod: Annotated[int, msgspec.Meta(ge=1, le=300)] = 12
+    qp: Annotated[int, msgspec.Meta(ge=1, le=51)] | None = None
 
 
 class TriggerTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ import gpiozero
 
 from bricktrack_common.errors import HardwareError
 from bricktrack_device.config import CameraTable, DeviceConfig
-from bricktrack_device.hardware.camera_settings import PiCameraSettings
+from bricktrack_device.hardware.camera_settings import MODES, PiCameraSettings
 from bricktrack_device.hardware.led_bank import LedBank
 from bricktrack_device.hardware.lgpio_pins import open_pin_factory
 from bricktrack_device.hardware.pi_camera import PiCamera
@@ -110,6 +110,8 @@ class PiRig:
 def camera_settings(table: CameraTable) -> PiCameraSettings:
     """Return what a configuration's camera table says."""
     return PiCameraSettings(
+        mode=MODES[table.mode],
+        qp=table.qp,
         exposure_us=table.exposure_us,
         analogue_gain=table.analogue_gain,
         colour_gains=table.colour_gains,

@@ -70,3 +70,11 @@ def test_the_command_line_overrides_the_file_and_is_checked_too(tmp_path: Path) 
 def test_an_unknown_backend_names_those_that_exist(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"'abacus'.*sim"):
         open_rig(load_config(None, {"backend": "abacus"}))
+
+
+@pytest.mark.parametrize("camera", ['mode = "full-field"', "qp = 22"])
+def test_the_simulation_refuses_what_it_cannot_film(tmp_path, camera):
+    path = tmp_path / "unit.toml"
+    path.write_text(f'backend = "sim"\n[camera]\n{camera}\n')
+    with pytest.raises(ConfigError, match="leave both out for backend 'sim'"):
+        open_rig(load_config(path))
