@@ -50,9 +50,9 @@ class CameraTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """``[camera]``: fixed exposure, gains and encoder; automatic control is off.
 
     ``mode`` is "1080p-crop" (the sensor's centre at full sampling) or "full-field" (all of it, binned by
-    two); a calibration belongs to one of them. ``qp`` fixes the encoder's quantiser instead of the bit rate. With
-    ``required = true`` a unit whose camera does not start refuses to arm; with ``false`` it arms and the run
-    says that the video is missing.
+    two); a calibration belongs to one of them. ``qp`` fixes the encoder's quantiser instead of the bit rate.
+    With ``required = true`` a unit whose camera does not start refuses to arm; with ``false`` it arms and the
+    run says that the video is missing.
     """
 
     required: bool = True
