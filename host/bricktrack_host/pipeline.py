@@ -49,7 +49,7 @@ from bricktrack_host.results.result_store import (
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.results.true_motion import read_true_motion
 from bricktrack_host.results.truth import TruthComparison, compare_with_truth
-from bricktrack_host.tracking.optical_track import led_motion, observe_leds, solve_poses
+from bricktrack_host.tracking.optical_track import SegmentMethod, led_motion, observe_leds, solve_poses
 from bricktrack_host.tracking.segment import Picture, Plane
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
@@ -57,6 +57,7 @@ logger = logging.getLogger(__name__)
 
 RESULTS_FOLDER = "results"
 REPORT_NAME = "report.html"
+_FIND = "decode and find LEDs"
 _N_OVERLAYS = 4
 _RETIME_PASSES = 1
 
@@ -168,19 +169,13 @@ def process_run(
         run = read_run(folder, verify_hashes=True)
         rays = load_calibration(calibration)
         brick = load_brick_model(layout)
-        frames = _check_video(run, rays)
+        frames = _require_video(run)
+        if run.manifest.camera is not None:
+            require_match(rays, unit=run.manifest.unit, sensor_mode=run.manifest.camera.mode)
     problems = list(run.problems)
     pictures = _Pictures(run, frames)
-    with stages("decode and find LEDs", frames.n_frames):
-        observations = observe_leds(
-            pictures.stream(),
-            rays.ray_model,
-            brick,
-            sensor_timestamp_ns=frames.sensor_timestamp_ns,
-            exposure_ns=frames.exposure_us * 1000,
-            method=settings.segmentation,
-            progress=stages.progress.advance_to,
-        )
+    with stages(_FIND, frames.n_frames):
+        observations = pictures.observe(rays.ray_model, brick, settings.segmentation, stages.progress)
     problems += pictures.problems()
     with stages("solve poses"):
         optical = solve_poses(
@@ -238,12 +233,29 @@ def process_run(
     return ProcessedRun(result, results_folder, report, comparison)
 
 
-def _check_video(run: Run, calibration: Calibration) -> FrameTimes:
+def observe_run(
+    run: Run, rays: RayModel, brick: BrickModel, *, progress: ProcessProgress | None = None
+) -> tuple[LedObservations, list[str]]:
+    """Return the LEDs seen in a run, and what was wrong with its video, in words.
+
+    Raises
+    ------
+    VideoError
+        If the run has no video with frame times.
+    """
+    frames = _require_video(run)
+    pictures = _Pictures(run, frames)
+    progress = progress or _Silent()
+    progress.stage(_FIND, frames.n_frames)
+    observations = pictures.observe(rays, brick, "default", progress)
+    return observations, [*run.problems, *pictures.problems()]
+
+
+def _require_video(run: Run) -> FrameTimes:
     if run.video is None or run.frames is None or run.manifest.camera is None:
         raise VideoError(f"{run.folder}: the run has no video with frame times; there is nothing to track")
     if run.frames.n_frames == 0:
         raise VideoError(f"{run.folder}: the run holds no frames")
-    require_match(calibration, unit=run.manifest.unit, sensor_mode=run.manifest.camera.mode)
     return run.frames
 
 
@@ -267,6 +279,19 @@ class _Pictures:
             if frame.index in self._keep:
                 self._kept[frame.index] = frame.picture.luma.copy()
             yield frame.index, frame.picture
+
+    def observe(
+        self, rays: RayModel, brick: BrickModel, method: SegmentMethod, progress: ProcessProgress
+    ) -> LedObservations:
+        return observe_leds(
+            self.stream(),
+            rays,
+            brick,
+            sensor_timestamp_ns=self._frames.sensor_timestamp_ns,
+            exposure_ns=self._frames.exposure_us * 1000,
+            method=method,
+            progress=progress.advance_to,
+        )
 
     def problems(self) -> list[str]:
         return [

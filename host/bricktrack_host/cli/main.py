@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bricktrack_host.cli import calibrate, demo, fleet, import_cmd, process
+from bricktrack_host.cli import calibrate, calibrate_leds, demo, fleet, import_cmd, process
 from bricktrack_host.cli._console import out, set_up_logging
 from bricktrack_host.cli._errors import BricktrackGroup
 from bricktrack_host.cli.pull import make_pull_command
@@ -46,6 +46,7 @@ app.command("arm")(fleet.arm)
 app.command("disarm")(fleet.disarm)
 app.command("pull")(make_pull_command(process.process_pulled))
 app.command("import")(import_cmd.import_recording)
+calibrate.app.command("leds")(calibrate_leds.leds)
 app.add_typer(calibrate.app, name="calibrate")
 app.command("process")(process.process)
 app.command("report")(process.report)
