@@ -17,10 +17,9 @@ from bricktrack_common.errors import ConfigError
 from bricktrack_device.sim.settings import SimSettings
 
 _RAMP_S = 0.5
-_IMPACT_RISE_S = 0.003  # clearances of about 1 mm are crossed at 0.1-0.3 m/s and stop within 1-3 ms
-_IMPACT_RING_HZ = 12.0
-_IMPACT_DECAY_PER_S = 25.0
-_IMPACT_SHARE = 0.15  # of the amplitude: some 0.1 m/s and up to 15 g at the default 3 mm
+_IMPACT_DECAY_S = 0.03
+_IMPACT_GONE_S = 0.7  # then exp(-23) is left of a kick: below a nanometre
+_IMPACT_ARM_MM = 120.0  # between the point of impact and the brick's middle, roughly
 
 Derivatives = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -57,8 +56,18 @@ def make_motion(settings: SimSettings) -> Motion:
         return sines
     times = np.arange(0.8, settings.shake_s - 1.0, 0.9)
     times = times + rng.uniform(-0.2, 0.2, len(times))
-    size = rng.normal(size=(len(times), 6)) * scale * _IMPACT_SHARE
-    return _WithImpacts(sines, times, size)
+    return _WithImpacts(
+        sines, times, rng.uniform(0.001, 0.003, len(times)), _kicks(settings, sines, times, rng)
+    )
+
+
+def _kicks(settings: SimSettings, sines: Motion, times: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return the changes of velocity at impacts: against the motion of the moment, with some spin."""
+    _, rate, _ = sines(times)
+    speed = np.linalg.norm(rate[:, :3], axis=1, keepdims=True)
+    size_mmps = 1e3 * settings.impact_mps * rng.uniform(0.6, 1.0, (len(times), 1))
+    spin = rng.uniform(-1, 1, (len(times), 3)) * size_mmps / _IMPACT_ARM_MM
+    return np.concatenate([-rate[:, :3] / np.maximum(speed, 1e-9) * size_mmps, spin], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,37 +145,39 @@ class _Sweep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _WithImpacts:
-    """Another motion, with ringing that sets in within 3 ms at each impact."""
+    """Another motion, and impacts: half-sine pulses of acceleration whose kick then dies away.
+
+    An impact adds ``dv P(tau) exp(-tau / T)``, with P the way of a body that a pulse brings to unit speed.
+    """
 
     base: Motion
     t_impact_s: FloatArray  # (k,)
-    size: FloatArray  # (k, 6)
+    width_s: FloatArray  # (k,)
+    kick: FloatArray  # (k, 6), changes of velocity, mm/s and rad/s
 
     def __call__(self, t_s: FloatArray) -> Derivatives:
         value, rate, second = self.base(t_s)
-        for t0, size in zip(self.t_impact_s, self.size, strict=True):
-            tau = t_s - t0
-            rows = np.flatnonzero((tau > 0) & (tau < 0.6))
+        for t0, width, kick in zip(self.t_impact_s, self.width_s, self.kick, strict=True):
+            rows = np.flatnonzero((t_s > t0) & (t_s < t0 + _IMPACT_GONE_S))
             if rows.size == 0:
                 continue
-            r = tau[rows]
-            step, dstep, ddstep = _smooth_step(r / _IMPACT_RISE_S)
-            gone, dgone, ddgone = _smooth_step((0.6 - r) / 0.3)
-            dstep, ddstep = dstep / _IMPACT_RISE_S, ddstep / _IMPACT_RISE_S**2
-            dgone, ddgone = -dgone / 0.3, ddgone / 0.3**2
-            edge = step * gone, dstep * gone + step * dgone, ddstep * gone + 2 * dstep * dgone + step * ddgone
-            omega, decay = 2 * np.pi * _IMPACT_RING_HZ, _IMPACT_DECAY_PER_S
-            e, sin, cos = np.exp(-decay * r), np.sin(omega * r), np.cos(omega * r)
-            ring = (
-                (e * sin)[:, None] * size,
-                (e * (omega * cos - decay * sin))[:, None] * size,
-                (e * ((decay**2 - omega**2) * sin - 2 * decay * omega * cos))[:, None] * size,
-            )
-            v, dv, ddv = _product(edge, ring)
+            tau = t_s[rows] - t0
+            decay = np.exp(-tau / _IMPACT_DECAY_S)
+            fading = decay, -decay / _IMPACT_DECAY_S, decay / _IMPACT_DECAY_S**2
+            way = tuple(part[:, None] * kick for part in _half_sine_way(tau, width))
+            v, dv, ddv = _product(fading, (way[0], way[1], way[2]))
             value[rows] += v
             rate[rows] += dv
             second[rows] += ddv
         return value, rate, second
+
+
+def _half_sine_way(tau_s: FloatArray, width_s: float) -> Derivatives:
+    """Return way, speed and acceleration of a body that a half-sine pulse brings to unit speed."""
+    pulse = np.minimum(tau_s, width_s)
+    angle = np.pi * pulse / width_s
+    way = pulse / 2 - width_s / (2 * np.pi) * np.sin(angle) + (tau_s - pulse)
+    return way, (1 - np.cos(angle)) / 2, np.pi / (2 * width_s) * np.sin(angle)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,8 +34,14 @@ class SimFaults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         The sensor resets itself silently, or repeats itself for ever, so long after the first edge.
     imu_absent : bool
         Nothing answers on the bus.
+    imu_bus_down : list of (start_s, duration_s)
+        When every transaction fails with ``imu_nack_errno``, after the first edge.
+    imu_bit_flip_every : int
+        Every n-th burst arrives with a wrong bit in the first channel's high byte.
     missed_edges : list of int
         Numbers of rising edges that the unit never hears of; 0 is the first.
+    late_edges : list of (number, us)
+        Rising edges that are stamped so much too late.
     """
 
     drop_frame_every: _Count = 0
@@ -45,7 +51,36 @@ class SimFaults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     imu_reset_s: _NotNegative | None = None
     imu_stuck_s: _NotNegative | None = None
     imu_absent: bool = False
+    imu_bus_down: list[Interval] = []
+    imu_bit_flip_every: _Count = 0
     missed_edges: list[_Count] = []
+    late_edges: list[tuple[_Count, _NotNegative]] = []
+
+
+class SimImu(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[sim.imu]``: the simulated BNO055, one on every bus that is opened.
+
+    Attributes
+    ----------
+    address : int
+        Where it answers.
+    sample_hz : float
+        How often it has a new sample.
+    clock_ppm : float or None
+        How much too slow its own clock is; by default the seed says, some 2000 ppm either way. Reads beat
+        with it: a sample is up to ``1 / sample_hz`` old, and now and then the same one is read twice.
+    noise, bias : float
+        Times those of the data sheet.
+    on_camera : list of str
+        Buses whose chip sits on the camera's component, which rests, and not on the brick.
+    """
+
+    address: Literal[0x28, 0x29] = 0x28
+    sample_hz: Annotated[float, msgspec.Meta(ge=10, le=2000)] = 100.0
+    clock_ppm: float | None = None
+    noise: _NotNegative = 1.0
+    bias: _NotNegative = 1.0
+    on_camera: list[str] = []
 
 
 class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -62,6 +97,8 @@ class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         ``motion_csv`` (columns ``t_s, x_mm, y_mm, z_mm`` and, if wanted, ``rx_deg, ry_deg, rz_deg``).
     amplitude_mm, amplitude_deg : float
         Largest displacement and rotation along an axis, roughly.
+    impact_mps : float
+        Largest change of velocity in an impact, within 1 to 3 ms: 0.1 m/s is 5 to 16 g, more clips at 16 g.
     shake_delay_s : float
         From arming to the first rising edge.
     quiet_s, shake_s : float
@@ -81,6 +118,7 @@ class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         Brightness of the surroundings and of reflections, 0 for a black box.
     noise : float
         Times the ordinary shot and read noise.
+    imu : SimImu
     faults : SimFaults
     """
 
@@ -90,6 +128,7 @@ class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     motion_csv: str = ""
     amplitude_mm: _NotNegative = 3.0
     amplitude_deg: _NotNegative = 2.0
+    impact_mps: _NotNegative = 0.1
     shake_delay_s: _Positive = 1.0
     quiet_s: _NotNegative = 1.0
     shake_s: _Positive = 12.0
@@ -102,4 +141,5 @@ class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     led_level: _Positive = 0.9
     clutter: _NotNegative = 1.0
     noise: _NotNegative = 1.0
+    imu: SimImu = SimImu()
     faults: SimFaults = SimFaults()

@@ -12,8 +12,9 @@ import numpy as np
 from bricktrack_common.rotations import continuous_quaternions, quaternion_from_matrix
 from bricktrack_common.run_manifest import TRUTH_NAME
 from bricktrack_device.interfaces import BusOpener, Camera
+from bricktrack_device.sim.imu_signal import ACC_LAG_S, GYRO_LAG_S
 from bricktrack_device.sim.sim_camera import SimCamera
-from bricktrack_device.sim.sim_i2c import ACC_LAG_S, GYRO_LAG_S, SimBusOpener
+from bricktrack_device.sim.sim_i2c import SimBusOpener
 from bricktrack_device.sim.sim_pins import SquareWave, make_factory
 from bricktrack_device.sim.world import SimWorld, make_epoch
 
@@ -46,8 +47,8 @@ class SimRig:
         return self._factory
 
     def bus_opener(self, bus: str) -> BusOpener:
-        """Return what opens the simulated bus, whatever it is called."""
-        return SimBusOpener(self._settings, self._epoch)
+        """Return what opens a simulated bus; whatever it is called, a BNO055 is on it."""
+        return SimBusOpener(self._settings, self._epoch, bus)
 
     def on_armed(self, t_armed_ns: int) -> None:
         """Let the table start: schedule the first edge, and drive the line from there on."""

@@ -4,8 +4,8 @@ It is a deterministic function of its settings and of CLOCK_MONOTONIC; only the 
 shared between processes, because arming decides it.
 """
 
+import math
 import multiprocessing
-from dataclasses import dataclass
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel, brick_model_from_file, load_brick_model
 from bricktrack_common.errors import ConfigError
-from bricktrack_common.rotations import matrix_from_rvec, right_jacobian, skew
+from bricktrack_common.rotations import matrix_from_rvec, right_jacobian
 from bricktrack_device.sim.motions import make_motion
 from bricktrack_device.sim.paper_layout import PAPER_LAYOUT
 from bricktrack_device.sim.settings import SimSettings
@@ -22,7 +22,6 @@ from bricktrack_device.sim.settings import SimSettings
 _REST_DEPTH_MM = 134.0  # of the middle of the LEDs' box
 _REST_RVEC_RAD = np.array([-0.0227, 0.0140, -0.0122])
 _GRAVITY_CAMERA_MPS2 = matrix_from_rvec(np.array([0.0364, 0.0, 0.0279])) @ np.array([0.0, 9.80665, 0.0])
-_STEP_S = 1e-5
 CARD_SLIDE_S = 0.06
 
 Epoch = Synchronized  # of an int64: the first edge, ns; 0 until the unit is armed
@@ -32,14 +31,6 @@ def make_epoch() -> "Epoch[int]":
     """Return the shared instant of the first edge, not yet set; a spawned process takes it as an argument."""
     epoch: Epoch[int] = multiprocessing.get_context("spawn").Value("q", 0)
     return epoch
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Inertial:
-    """What an ideal inertial sensor at the lever arm feels, in its own axes."""
-
-    specific_force_mps2: FloatArray
-    omega_radps: FloatArray
 
 
 class SimWorld:
@@ -58,6 +49,9 @@ class SimWorld:
         self._epoch = epoch
         self._motion = make_motion(settings)
         self._R_rest = matrix_from_rvec(_REST_RVEC_RAD)
+        imu = self.brick.imu_lever_arm_mm, self.brick.R_brick_imu
+        self._lever_arm_mm = np.zeros(3) if imu[0] is None else imu[0]
+        self._R_brick_imu = np.eye(3) if imu[1] is None else imu[1]
         middle_mm = 0.5 * (self.brick.led_positions_mm.max(axis=0) + self.brick.led_positions_mm.min(axis=0))
         self._t_rest_mm = np.array([0.0, 0.0, _REST_DEPTH_MM]) - self._R_rest @ middle_mm
         unknown = {h.name for h in settings.hidden_leds} - set(self.brick.led_names)
@@ -104,19 +98,28 @@ class SimWorld:
         q, dq, _ = self._coordinates(self.since_first_edge_s(t_ns))
         return _omega(q, dq), dq[:, :3]
 
-    def inertial(self, since_s: FloatArray) -> Inertial:
-        """Return the ideal inertial signals at times (n,) after the first edge, s."""
+    def specific_force(self, since_s: FloatArray) -> FloatArray:
+        """Return what an ideal accelerometer at the lever arm feels, m/s^2, its axes, shape (n, 3).
+
+        ``since_s``, shape (n,), counts from the first edge.
+        """
         q, dq, ddq = self._coordinates(since_s)
-        omega = _omega(q, dq)
-        # The derivative of the right Jacobian by a central difference: h^2 times its third derivative, 1e-8.
-        before, after = (self._coordinates(since_s + s) for s in (-_STEP_S, _STEP_S))
-        alpha = (_omega(*after[:2]) - _omega(*before[:2])) / (2 * _STEP_S)
+        omega, alpha = angular_rate_and_acceleration(q[:, 3:], dq[:, 3:], ddq[:, 3:])
         R = self._R_rest @ matrix_from_rvec(q[:, 3:])
-        lever_arm_m = _lever_arm_mm(self.brick) * 1e-3
-        swing = skew(alpha) @ lever_arm_m + (skew(omega) @ skew(omega)) @ lever_arm_m
-        force_brick = np.einsum("nji,nj->ni", R, ddq[:, :3] * 1e-3 - _GRAVITY_CAMERA_MPS2) + swing
-        R_brick_imu = np.eye(3) if self.brick.R_brick_imu is None else self.brick.R_brick_imu
-        return Inertial(force_brick @ R_brick_imu, omega @ R_brick_imu)
+        lever_arm_m = np.broadcast_to(self._lever_arm_mm * 1e-3, omega.shape)
+        swing = np.cross(alpha, lever_arm_m) + np.cross(omega, np.cross(omega, lever_arm_m))
+        force = np.einsum("nji,nj->ni", R, ddq[:, :3] * 1e-3 - _GRAVITY_CAMERA_MPS2) + swing
+        return np.asarray(force @ self._R_brick_imu)
+
+    def angular_rate(self, since_s: FloatArray) -> FloatArray:
+        """Return what an ideal gyroscope feels, rad/s, IMU axes, shape (n, 3)."""
+        q, dq, _ = self._coordinates(since_s)
+        return np.asarray(_omega(q, dq) @ self._R_brick_imu)
+
+    def R_camera_imu(self, since_s: FloatArray) -> FloatArray:  # noqa: N802
+        """Return the sensor's orientation, shape (n, 3, 3)."""
+        q, _, _ = self._coordinates(since_s)
+        return np.asarray(self._R_rest @ matrix_from_rvec(q[:, 3:]) @ self._R_brick_imu)
 
     def card_cover(self, t_ns: IntArray) -> FloatArray:
         """Return how far the opaque card has slid before the lens: 0 away, 1 hides everything.
@@ -160,9 +163,32 @@ def load_layout(settings: SimSettings) -> BrickModel:
     return brick_model_from_file(PAPER_LAYOUT, where="the simulated brick")
 
 
-def _lever_arm_mm(brick: BrickModel) -> FloatArray:
-    return np.zeros(3) if brick.imu_lever_arm_mm is None else brick.imu_lever_arm_mm
-
-
 def _omega(q: FloatArray, dq: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,nj->ni", right_jacobian(q[:, 3:]), dq[:, 3:]))
+
+
+def angular_rate_and_acceleration(
+    rvec_rad: FloatArray, rate: FloatArray, second: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return body rate and acceleration, shape (n, 3), of a rotation vector with these two derivatives.
+
+    With ``omega = r' - a r x r' + b r x (r x r')``, ``a = (1 - cos s) / s^2``, ``b = (s - sin s) / s^3``; the
+    derivatives of a and b by s^2 are taken from their series, which converge for every angle.
+    """
+    s2 = np.sum(rvec_rad * rvec_rad, axis=-1, keepdims=True)
+    ds2 = 2 * np.sum(rvec_rad * rate, axis=-1, keepdims=True)
+    (a, da), (b, db) = (_series(s2, first) for first in (2, 3))
+    cross = np.cross(rvec_rad, rate)
+    twice = np.cross(rvec_rad, cross)
+    cross_rate = np.cross(rvec_rad, second)
+    twice_rate = np.cross(rate, cross) + np.cross(rvec_rad, cross_rate)
+    omega = rate - a * cross + b * twice
+    alpha = second - a * cross_rate - da * ds2 * cross + b * twice_rate + db * ds2 * twice
+    return np.asarray(omega), np.asarray(alpha)
+
+
+def _series(s2: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
+    """Return sum of (-s2)^k / (2 k + first)! and its derivative by s2."""
+    coefficients = [(-1) ** k / math.factorial(2 * k + first) for k in range(14)]
+    slopes = [k * c for k, c in enumerate(coefficients)][1:]
+    return np.polynomial.polynomial.polyval(s2, coefficients), np.polynomial.polynomial.polyval(s2, slopes)
