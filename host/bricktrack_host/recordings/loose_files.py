@@ -3,7 +3,7 @@
 import csv
 import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -41,6 +41,9 @@ class LooseImu:
     gyro_dps: FloatArray
 
 
+_MAX_DECIMAL_EXPONENT = 18  # of int64
+
+
 def read_timestamps(path: Path, *, unit: TimestampUnit = "auto") -> IntArray:
     """Return the stamps of a video's pictures, int64 us, one a line, strictly increasing.
 
@@ -65,10 +68,12 @@ def read_timestamps(path: Path, *, unit: TimestampUnit = "auto") -> IntArray:
     for i, (n, text) in enumerate(rows):
         try:
             value = Decimal(text) * scale
+            if value and value.adjusted() > _MAX_DECIMAL_EXPONENT:  # before a million digits are written out
+                raise OverflowError
             if value != value.to_integral_value() and unit == "us":
                 raise VideoError(f"{path}: line {n}: {text!r} us is no whole number. Is the file in ms?")
             stamps[i] = int(value.to_integral_value())
-        except (InvalidOperation, ValueError, OverflowError) as e:
+        except (ArithmeticError, ValueError) as e:  # of Decimal, int and int64
             if isinstance(e, VideoError):
                 raise
             raise VideoError(

@@ -161,3 +161,11 @@ def test_another_size_is_read_from_the_sensors_corner(write):
 def test_a_wrong_rig_file_names_the_key(write, change, words):
     with pytest.raises(ConfigError, match=words):
         read_rig(write(RIG.replace(*change)), table="motion")
+
+
+@pytest.mark.parametrize("text", ["1E100000", "-1E19", "NaN", "Infinity", "1e999999999"])
+def test_a_stamp_beyond_all_time_is_refused_at_once(tmp_path, text):
+    path = tmp_path / "stamps.txt"
+    path.write_text(f"0\n{text}\n")
+    with pytest.raises(VideoError, match="line 2"):
+        read_timestamps(path)
