@@ -14,8 +14,8 @@ _TINY = np.float32(1e-9)
 
 def clearance_mm(
     x: _Single, y: _Single, centre_mm: _Single, axis: _Single, *, radius_mm: float, collar_mm: float
-) -> tuple[_Single, _Single]:
-    """Return the clearance of rays, and how far they pass from the axis at the foot of the body.
+) -> _Single:
+    """Return the clearance of rays, mm.
 
     Parameters
     ----------
@@ -29,8 +29,7 @@ def clearance_mm(
 
     Returns
     -------
-    clearance_mm, foot_mm : ndarray, shape (rows, columns)
-        ``foot_mm``: distance from the axis in the plane through the cylinder's back rim.
+    clearance_mm : ndarray, shape (rows, columns)
 
     Notes
     -----
@@ -41,14 +40,7 @@ def clearance_mm(
     brought from the cylinder's cross-section to across the ray.
     """
     r, collar = np.float32(radius_mm), np.float32(collar_mm)
-    cx, cy, cz = (centre_mm[:, i, None] for i in range(3))
-    ax, ay, az = (axis[:, i, None] for i in range(3))
-    ox, oy = x * cz - cx, y * cz - cy
-    dd = x * x + y * y + 1
-    od = ox * x + oy * y
-    oo = ox * ox + oy * oy
-    oa = ox * ax + oy * ay
-    da = np.minimum(x * ax + y * ay + az, np.float32(-1e-3))
+    oo, od, dd, oa, da = _products(x, y, centre_mm, axis)
     nearest = -od / dd
     q_mm = np.sqrt(np.maximum(oo + nearest * od, 0))
     forward = oa + nearest * da
@@ -56,14 +48,31 @@ def clearance_mm(
 
     across = np.maximum(dd - da * da, _TINY)
     s_axis = (oa * da - od) / across
-    s_centre = -oa / da
-    s_foot: _Single = np.asarray(-(oa + collar) / da, dtype=np.float32)
+    s_centre, s_foot = -oa / da, -(oa + collar) / da
     s: _Single = np.asarray(np.minimum(np.maximum(s_axis, s_centre), s_foot), dtype=np.float32)
     rho_mm = _from_axis(s, oo, od, dd, oa, da)
     height = oa + s * da
     slant = (od + s * dd - height * da) / (np.maximum(rho_mm, np.float32(1e-4)) * da)
     cylinder = (r - rho_mm) / np.sqrt(1 + slant * slant)
-    return np.maximum(dome, cylinder), _from_axis(s_foot, oo, od, dd, oa, da)
+    return np.asarray(np.maximum(dome, cylinder), dtype=np.float32)
+
+
+def foot_mm(x: _Single, y: _Single, centre_mm: _Single, axis: _Single, *, collar_mm: float) -> _Single:
+    """Return how far rays pass from the axis in the plane of the cylinder's back rim; see `clearance_mm`."""
+    oo, od, dd, oa, da = _products(x, y, centre_mm, axis)
+    s: _Single = np.asarray(-(oa + np.float32(collar_mm)) / da, dtype=np.float32)
+    return _from_axis(s, oo, od, dd, oa, da)
+
+
+def _products(
+    x: _Single, y: _Single, centre_mm: _Single, axis: _Single
+) -> tuple[_Single, _Single, _Single, _Single, _Single]:
+    """Return o.o, o.d, d.d, o.a and d.a."""
+    cx, cy, cz = (centre_mm[:, i, None] for i in range(3))
+    ax, ay, az = (axis[:, i, None] for i in range(3))
+    ox, oy = x * cz - cx, y * cz - cy
+    da = np.minimum(x * ax + y * ay + az, np.float32(-1e-3))
+    return ox * ox + oy * oy, ox * x + oy * y, x * x + y * y + 1, ox * ax + oy * ay, da
 
 
 def _from_axis(s: _Single, oo: _Single, od: _Single, dd: _Single, oa: _Single, da: _Single) -> _Single:

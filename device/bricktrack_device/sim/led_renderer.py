@@ -8,7 +8,7 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.camera_model import SensorMode
-from bricktrack_device.sim.dome import clearance_mm
+from bricktrack_device.sim.dome import clearance_mm, foot_mm
 from bricktrack_device.sim.lens import Lens
 from bricktrack_device.sim.scene import BAND_ROWS, LIGHT_OF_LUMA, Plane, Scene, Single, noise_sd, to_luma
 from bricktrack_device.sim.settings import SimSettings
@@ -138,40 +138,56 @@ class LedRenderer:
         if facing.min() < 0.05:
             return  # it looks past the camera
         z_mm = float(centres[:, 2].mean())
-        window = self._window(uv, 1.2 * _BEZEL_RADII * radius * self._lens.focal_px / z_mm + 6)
+        scale = radius * self._lens.focal_px / z_mm
+        moving = np.concatenate([centres, axes, lit[:, None]], axis=1)
+        self._draw_bezel(picture, moving, self._window(uv, 1.2 * _BEZEL_RADII * scale + 4), radius, collar)
+        window = self._window(uv, 1.15 * scale + (collar / radius) * scale + 6)
         if window is None:
             return
         u0, u1, v0, v1, blur_px = window
         rows = np.arange(v0, v1)
         x, y = self._x[v0:v1, u0:u1], self._y[v0:v1, u0:u1]
-        slope_a_px = np.sqrt(
-            abs((x[-1, -1] - x[-1, 0]) * (y[-1, 0] - y[0, 0])) / ((u1 - u0 - 1) * (v1 - v0 - 1))
-        )
-        px_per_mm = np.float32(1 / (slope_a_px * z_mm))
+        px_per_mm = _px_per_slope(x, y) / np.float32(z_mm)
         out_of_focus_px = self._lens.focal_px * _APERTURE_MM * abs(1 / z_mm - 1 / _FOCUS_MM)
         soft_px = np.float32(0.5 + np.hypot(1.8 * _PSF_SIGMA_PX, 0.5 * out_of_focus_px))
-
         n = int(np.clip(np.ceil(blur_px / _BLUR_STEP_PX), 1, _MAX_INSTANTS))
-        covered, glow, shade = (np.zeros(x.shape, dtype=np.float32) for _ in range(3))
-        moving = np.concatenate([centres, axes, lit[:, None]], axis=1)
+        covered, glow = np.zeros(x.shape, dtype=np.float32), np.zeros(x.shape, dtype=np.float32)
         for k in range(n):
             now = self._at(moving, rows, (k + 0.5) / n).astype(np.float32)
-            deep, from_axis = clearance_mm(x, y, now[:, :3], now[:, 3:6], radius_mm=radius, collar_mm=collar)
+            deep = clearance_mm(x, y, now[:, :3], now[:, 3:6], radius_mm=radius, collar_mm=collar)
             share = _edge(deep * px_per_mm, soft_px) * now[:, 6:]
             from_middle = 1 - np.clip(deep / np.float32(radius), 0, 1)
             bright = 1 - np.float32(_LIMB) * (1 - np.sqrt(np.maximum(1 - from_middle * from_middle, 0)))
-            if k == n // 2:
-                shade = _edge((np.float32(_BEZEL_RADII * radius) - from_axis) * px_per_mm, np.float32(2))
             covered += share
             glow += share * bright
-        behind = LIGHT_OF_LUMA[picture[v0:v1, u0:u1]] * (1 - np.float32(0.9) * shade)
         fall_off = 1 / (1 + x * x + y * y)  # the lens is darker towards the corners
         led: Single = np.asarray(level / np.float32(n) * glow * fall_off, dtype=np.float32)
         first = int(self._rng.integers(0, self._noise.size - x.size))
         noise = self._noise[first : first + x.size].reshape(x.shape)
         grain = noise_sd(led, self._settings) * noise * (covered > 0)
+        behind = LIGHT_OF_LUMA[picture[v0:v1, u0:u1]]
         light = np.asarray(behind * (1 - covered / np.float32(n)) + led + grain, dtype=np.float32)
         picture[v0:v1, u0:u1] = to_luma(light)
+
+    def _draw_bezel(
+        self,
+        picture: Plane,
+        moving: FloatArray,
+        window: tuple[int, int, int, int, float] | None,
+        radius_mm: float,
+        collar_mm: float,
+    ) -> None:
+        """Darken the wall around the foot of an LED, sharp: it frames the LED and is not to be measured."""
+        if window is None:
+            return
+        u0, u1, v0, v1, _ = window
+        x, y = self._x[v0:v1, u0:u1], self._y[v0:v1, u0:u1]
+        now = self._at(moving, np.arange(v0, v1), 0.5).astype(np.float32)
+        from_axis = foot_mm(x, y, now[:, :3], now[:, 3:6], collar_mm=collar_mm)
+        px_per_mm = _px_per_slope(x, y) / np.float32(moving[:, 2].mean())
+        shade = _edge((np.float32(_BEZEL_RADII * radius_mm) - from_axis) * px_per_mm, np.float32(2))
+        there = LIGHT_OF_LUMA[picture[v0:v1, u0:u1]]
+        picture[v0:v1, u0:u1] = to_luma(np.asarray(there * (1 - np.float32(0.9) * shade), dtype=np.float32))
 
     def _draw_card(self, picture: Plane, cover: FloatArray) -> None:
         """Slide the card in from the left; 1 covers the whole picture."""
@@ -190,3 +206,10 @@ def _edge(inside_px: Single, half_width_px: np.float32) -> Single:
     """Return a smooth step from 0 to 1 over an edge, symmetric about 0."""
     t = np.clip(np.float32(0.5) + inside_px * (np.float32(0.5) / half_width_px), 0, 1)
     return np.asarray(t * t * (3 - 2 * t))
+
+
+def _px_per_slope(x: Single, y: Single) -> np.float32:
+    """Return the scale of a window of the slope tables."""
+    rows, columns = x.shape
+    area = abs(float(x[-1, -1] - x[-1, 0]) * float(y[-1, 0] - y[0, 0])) / ((columns - 1) * (rows - 1))
+    return np.float32(1 / np.sqrt(area))

@@ -113,7 +113,7 @@ def _wall(
     light = np.where(to_hole < hole, _HOLE_LIGHT, light)
     label_u, label_v = 0.08 * shape[1], 0.4 * shape[0]
     on_label = (np.abs(u - label_u) < 38) & (np.abs(v - label_v) < 110)
-    light = np.where(on_label, np.where(np.abs(u - label_u) + v % 30 < 34, 0.02, 0.4), light)
+    light = np.where(on_label, np.where((np.abs(u - label_u) < 26) & (v % 30 < 11), 0.02, 0.4), light)
     light = light * min(clutter, 4.0)
     for _ in range(6):
         at, size, turn = (
