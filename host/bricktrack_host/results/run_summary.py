@@ -164,7 +164,7 @@ def _flag_problems(result: RunResult, figures: KeyFigures) -> list[str]:
     if n := count(PoseFlag.AMBIGUOUS):
         found.append(f"in {n} frames more than one pose fitted; none is given there")
     if n := count(PoseFlag.UNVERIFIED):
-        found.append(f"in {n} frames too few LEDs were seen to check which is which")
+        found.append(f"in {n} frame{'' if n == 1 else 's'} too few LEDs were seen to check which is which")
     track = main_track(result)
     if track is not None and (n := int(np.count_nonzero(track.flags & int(PoseFlag.CLIPPED)))):
         found.append(f"the inertial sensor was at its range limit in {n} samples")
