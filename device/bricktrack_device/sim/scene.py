@@ -21,8 +21,8 @@ CARD_LIGHT = 0.004
 
 _N_EXPOSURES = 4  # noisy pictures made once and shown in turn
 _LEVELS = 4096
-_READ_NOISE = 0.004  # of the full range, standard deviation, linear light
-_SHOT_NOISE = 0.006  # at full light
+_READ_NOISE = 0.0012  # of the full range, standard deviation, linear light
+_SHOT_NOISE = 0.010  # at full light: some 5000 electrons, and demosaicing that averages
 _WALL_LIGHT, _HOLE_LIGHT, _DARK_LIGHT = 0.045, 0.004, 0.002
 _WALL_BEYOND_LEDS_PX = 230
 

@@ -18,6 +18,11 @@ _BUS_BYTE_S = 9 / 400_000
 _BUS_OVERHEAD_S = 0.0003
 
 
+def bus_stream(bus: str) -> int:
+    """Return the number that tells the chip on this bus, its biases and its clock from others."""
+    return crc32(bus.encode())
+
+
 @dataclass(frozen=True, slots=True)
 class SimBusOpener:
     """Opens a simulated bus in whichever process it is called; passes to that process when it is spawned."""
@@ -45,7 +50,7 @@ class SimI2c:
         self._world = world
         self._settings = world.settings
         self._faults = world.settings.faults
-        stream = crc32(bus.encode())
+        stream = bus_stream(bus)
         sensors = ImuSensors(world, on_camera=bus in world.settings.imu.on_camera, stream=stream)
         self.chip = Bno055Chip(
             np.random.default_rng([world.settings.seed, 10, stream]).bytes(16),

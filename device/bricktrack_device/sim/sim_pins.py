@@ -5,6 +5,7 @@ stamps in its interrupt and reports later.
 """
 
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import gpiozero.pins.mock
@@ -13,8 +14,9 @@ import numpy as np
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_device.sim.world import SimWorld
 
-_TAIL_S = 30.0  # the wave goes on after the shake, as a laboratory's does
 _LINE_DELAY_NS = 100_000
+_EDGES_AT_A_TIME = 200
+_UNHEARD_WAIT_S = 0.02
 
 
 class StampedPin(gpiozero.pins.mock.MockPin):  # type: ignore[misc]
@@ -22,15 +24,20 @@ class StampedPin(gpiozero.pins.mock.MockPin):  # type: ignore[misc]
 
     def drive_at(self, high: bool, ticks_s: float) -> None:
         """Set the line's level as of ``ticks_s``, s of CLOCK_MONOTONIC, and fire the handler on a change."""
-        if self.state != high:
+        if self._function == "input" and bool(self.state) != high:
             self._state = high
             self._last_change = ticks_s
-            if self._when_changed is not None:
+            if self.is_heard:
                 self._call_when_changed()
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether somebody listens to the changes."""
+        return self._when_changed is not None
 
 
 class SquareWave:
-    """A thread that drives all pins of a factory with the world's square wave."""
+    """A thread that drives all input pins of a factory with the world's square wave."""
 
     def __init__(self, world: SimWorld, factory: gpiozero.pins.mock.MockFactory) -> None:
         self._world = world
@@ -39,7 +46,7 @@ class SquareWave:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Drive the wave from the world's first edge on; a wave that runs already ends first."""
+        """Drive the wave from the world's first edge on until `stop`; a wave that runs already ends first."""
         self.stop()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(self._stop,), name="sim-wave", daemon=True)
@@ -54,26 +61,42 @@ class SquareWave:
         self._drive(False, monotonic_ns())
 
     def _run(self, stop: threading.Event) -> None:
+        for high, stamp_ns in self._changes():
+            while not self._is_heard() and monotonic_ns() <= stamp_ns:
+                if stop.wait(_UNHEARD_WAIT_S):
+                    return
+            if not self._is_heard():
+                continue  # over before anybody listened
+            left_s = (stamp_ns + _LINE_DELAY_NS - monotonic_ns()) * 1e-9
+            if (left_s > 0 and stop.wait(left_s)) or stop.is_set():
+                return
+            self._drive(high, stamp_ns)
+
+    def _changes(self) -> Iterator[tuple[bool, int]]:
+        """Yield level and stamp of the line's changes, for ever."""
         s = self._world.settings
-        rng = np.random.default_rng([s.seed, 4])
-        missed = set(s.faults.missed_edges)
+        missed, late_us = set(s.faults.missed_edges), dict(s.faults.late_edges)
         half_ns = round(0.5e9 / s.square_wave_hz)
-        n_edges = int((s.quiet_s + s.shake_s + _TAIL_S) * s.square_wave_hz)
-        for i, edge in enumerate(self._world.edge_times_ns(0, n_edges).tolist()):
-            jitter = round(float(rng.normal()) * s.edge_jitter_us * 1e3)
-            if i in missed:
-                continue
-            for high, t_ns in ((True, edge + jitter), (False, edge + half_ns)):
-                left_s = (t_ns + _LINE_DELAY_NS - monotonic_ns()) * 1e-9
-                if left_s > 0 and stop.wait(left_s):
-                    return
-                if stop.is_set():
-                    return
-                self._drive(high, t_ns)
+        first = 0
+        while True:
+            rng = np.random.default_rng([s.seed, 4, first])
+            jitter_us = rng.normal(size=_EDGES_AT_A_TIME) * s.edge_jitter_us
+            edges = self._world.edge_times_ns(first, first + _EDGES_AT_A_TIME).tolist()
+            for i, edge_ns in enumerate(edges, start=first):
+                if i in missed:
+                    continue  # neither change was heard: the line seems to have stayed low
+                yield True, edge_ns + round((jitter_us[i - first] + late_us.get(i, 0.0)) * 1e3)
+                yield False, edge_ns + half_ns
+            first += _EDGES_AT_A_TIME
+
+    def _is_heard(self) -> bool:
+        return any(pin.is_heard for pin in self._pins())
+
+    def _pins(self) -> list[Any]:
+        return list(self._factory.pins.values())
 
     def _drive(self, high: bool, t_ns: int) -> None:
-        pins: list[Any] = list(self._factory.pins.values())
-        for pin in pins:
+        for pin in self._pins():
             pin.drive_at(high, t_ns * 1e-9)
 
 
