@@ -1,6 +1,6 @@
 """The figures of a run's report, each a matplotlib `Figure` made from values; no state is shared."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,12 +8,15 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 from scipy.signal import welch
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.quality import PoseFlag
+from bricktrack_host.reporting.figure_layout import figure_legend, panel_grid
+from bricktrack_host.reporting.figure_marks import band, dots, instants, line, spans
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.run_summary import KeyFigures, main_track
 
@@ -25,7 +28,6 @@ SHADE = "#e6e2da"
 IMPACT = "#b3261e"
 # Seven hues that stay apart for colour-blind readers (after P. Tol's "bright" scheme), in LED order.
 LED_COLOURS = ("#4477aa", "#ee6677", "#228833", "#b89b1e", "#2fa6c2", "#aa3377", "#777777")
-WIDTH_IN = 10.4
 
 STYLE: Any = {
     "font.family": "DejaVu Sans",
@@ -33,6 +35,7 @@ STYLE: Any = {
     "axes.titlesize": 9,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # given, it is not looked for
     "axes.labelsize": 8.5,
     "axes.edgecolor": "#8a8f98",
     "axes.labelcolor": INK,
@@ -54,7 +57,6 @@ STYLE: Any = {
     "svg.fonttype": "path",
     "svg.hashsalt": "bricktrack",
     "path.simplify_threshold": 0.2,
-    "figure.constrained_layout.use": True,
 }
 """For `matplotlib.rc_context` around making *and* saving the figures."""
 
@@ -131,8 +133,10 @@ def motion_figure(
     ``span_s`` limits the time axis, for a close-up.
     """
     axis = TimeAxis.of(result)
-    fig = Figure(figsize=(WIDTH_IN, 9.6 if span_s is None else 6.0))
-    axes = fig.subplots(6 if span_s is None else 3, 1 if span_s is None else 2, sharex=True, squeeze=False)
+    if span_s is None:
+        fig, axes = panel_grid(6, height_in=9.6, legend=True)
+    else:
+        fig, axes = panel_grid(3, 2, height_in=6.0, legend=True)
     panels = axes[:, 0] if span_s is None else axes.T.reshape(-1)
     track = main_track(result)
     optical = result.optical
@@ -154,12 +158,10 @@ def motion_figure(
         mark_events(ax, axis, result, figures)
         if track is not None:
             y, half = fused_y[inside, i], 1.96 * fused_sd[inside, i]
-            ax.fill_between(
-                fused_s[inside], y - half, y + half, color=FUSED, alpha=0.22, lw=0, label="95 % band"
-            )
-            ax.plot(fused_s[inside], y, color=FUSED, lw=0.9, label="fused")
+            band(ax, fused_s[inside], y - half, y + half, color=FUSED, alpha=0.22, label="95 % band")
+            line(ax, fused_s[inside], y, color=FUSED, lw=0.9, label="fused")
         if span_s is None:
-            ax.plot(optical_s, optical_y[:, i], ".", color=OPTICAL, ms=3, mew=0, label="optical")
+            dots(ax, optical_s, optical_y[:, i], size_pt=1.9, color=OPTICAL, label="optical")
         else:
             ax.errorbar(
                 optical_s[chosen], optical_y[chosen, i], 1.96 * optical_sd[chosen, i], fmt="o", color=OPTICAL,
@@ -171,7 +173,6 @@ def motion_figure(
     figure_legend(fig, panels)
     for ax in axes[-1]:
         ax.set_xlabel(axis.label)
-    fig.align_ylabels()
     return fig
 
 
@@ -190,8 +191,7 @@ def spectrum_figure(result: RunResult) -> Figure | None:
     values, _ = _six(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
     camera = result.manifest.camera
     nyquist_hz = 0.5e6 / camera.frame_duration_us if camera and camera.frame_duration_us > 0 else None
-    fig = Figure(figsize=(WIDTH_IN, 2.9))
-    axes = fig.subplots(1, 2)
+    fig, ((*axes,),) = panel_grid(1, 2, height_in=2.9, titles=True, share_x=False)
     for i in range(6):
         y = np.interp(even_s, t_s, values[inside, i])
         n = min(len(y), 512)
@@ -205,6 +205,7 @@ def spectrum_figure(result: RunResult) -> Figure | None:
     for ax in axes:
         ax.set_xlabel("frequency, Hz")
         ax.set_xlim(0, 0.5 / step_s)
+        ax.yaxis.set_minor_formatter(NullFormatter())
         if nyquist_hz is not None:
             ax.axvline(nyquist_hz, color=INK, lw=0.7, ls=":")
         ax.legend(loc="upper right")
@@ -233,22 +234,7 @@ def _six(
 
 def mark_events(ax: Axes, axis: TimeAxis, result: RunResult, figures: KeyFigures) -> None:
     """Shade the dropouts, and mark trigger and impacts."""
-    for n, (first, last) in enumerate(axis.s(figures.dropouts_ns).tolist()):
-        ax.axvspan(first, last, color=SHADE, lw=0, label="no optical pose used" if n == 0 else None)
-    for n, t_s in enumerate(axis.s(figures.impacts_ns).tolist()):
-        ax.axvline(t_s, color=IMPACT, lw=0.8, alpha=0.75, label="impact" if n == 0 else None)
+    spans(ax, axis.s(figures.dropouts_ns), color=SHADE, label="no optical pose used")
+    instants(ax, axis.s(figures.impacts_ns), color=IMPACT, lw=0.8, alpha=0.75, label="impact")
     if result.t0_ns is not None:
         ax.axvline((result.t0_ns - axis.origin_ns) / 1e9, color=INK, lw=0.7, ls=(0, (4, 3)), label="trigger")
-
-
-def figure_legend(fig: Figure, axes: Iterable[Axes]) -> None:
-    """Put one legend of everything that the axes show in a row above the figure, right."""
-    entries: dict[str, Any] = {}
-    for ax in axes:
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    if entries:
-        fig.legend(
-            list(entries.values()), list(entries), loc="outside upper right", ncols=len(entries),
-            borderaxespad=0.2, columnspacing=1.4, handletextpad=0.5, markerscale=2,
-        )  # fmt: skip

@@ -8,6 +8,8 @@ from matplotlib.patches import Polygon
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.imu_records import UNUSABLE
 from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.reporting.figure_layout import figure_legend, panel_grid, picture_axes
+from bricktrack_host.reporting.figure_marks import band, dots, line
 from bricktrack_host.reporting.plots import (
     FUSED,
     IMPACT,
@@ -15,11 +17,8 @@ from bricktrack_host.reporting.plots import (
     LED_COLOURS,
     OPTICAL,
     TRUTH,
-    WIDTH_IN,
     CalibrationPicture,
-    FrameOverlay,
     TimeAxis,
-    figure_legend,
     mark_events,
 )
 from bricktrack_host.results.result_store import RunResult
@@ -30,8 +29,8 @@ from bricktrack_host.results.truth import COMPONENTS, TruthComparison
 def residual_time_figure(result: RunResult) -> Figure:
     """Return the distance between each LED as seen and as predicted, over time."""
     axis = TimeAxis.of(result)
-    fig = Figure(figsize=(WIDTH_IN, 3.4))
-    axes = fig.subplots(2, 1, sharex=True)
+    fig, ((upper,), (lower,)) = panel_grid(2, height_in=3.4, legend=True)
+    axes = upper, lower
     t_s = axis.s(result.optical.t_ns)
     residual = result.optical.residual_px
     limit = _limit(residual, 0.25)
@@ -40,9 +39,10 @@ def residual_time_figure(result: RunResult) -> Figure:
         colour = LED_COLOURS[i % len(LED_COLOURS)]
         for k in (0, 1):
             y = residual[:, i, k]
-            axes[k].plot(t_s, y, ".", ms=size, mew=0, color=colour, label=name)
+            dots(axes[k], t_s, y, size_pt=0.55 * size, color=colour, label=name)
             beyond = np.abs(y) > limit
-            axes[k].plot(t_s[beyond], np.sign(y[beyond]) * limit * 0.97, "x", ms=4, color=colour)
+            if beyond.any():
+                axes[k].plot(t_s[beyond], np.sign(y[beyond]) * limit * 0.97, "x", ms=4, color=colour)
     for k, name in ((0, "u, px"), (1, "v, px")):
         axes[k].set_ylim(-limit, limit)
         axes[k].set_ylabel(f"residual {name}")
@@ -55,13 +55,12 @@ def residual_picture_figure(result: RunResult) -> Figure:
     """Return where in the picture the LEDs were, and their mean residual there as arrows."""
     camera = result.manifest.camera
     width, height = (camera.mode.width, camera.mode.height) if camera else (1920, 1080)
-    fig = Figure(figsize=(6.6, 4.1))
-    ax = fig.subplots()
+    fig, ax = picture_axes(width, height)
     uv, residual = result.observations.uv_px, result.optical.residual_px
     means = []
     for i, name in enumerate(result.led_names):
         colour = LED_COLOURS[i % len(LED_COLOURS)]
-        ax.plot(uv[:, i, 0], uv[:, i, 1], ".", ms=1.5, mew=0, color=colour, alpha=0.5)
+        dots(ax, uv[:, i, 0], uv[:, i, 1], size_pt=0.75, color=colour, alpha=0.5)
         used = np.isfinite(residual[:, i]).all(axis=1)
         if used.any():
             at = np.median(uv[used, i], axis=0)
@@ -76,15 +75,14 @@ def residual_picture_figure(result: RunResult) -> Figure:
         scale = longest / 90  # the longest arrow is 90 px of the picture
         ax.quiver(u, v, du, dv, angles="xy", scale_units="xy", scale=scale, width=0.004, color=INK, zorder=3)
         ax.set_title(f"longest arrow: mean residual of {longest:.3f} px")
-    _picture_axes(ax, width, height)
     return fig
 
 
 def timing_figure(result: RunResult, figures: KeyFigures) -> Figure:
     """Return frame intervals, lateness of the inertial slots, and residuals of the edges."""
     axis = TimeAxis.of(result)
-    fig = Figure(figsize=(WIDTH_IN, 5.4))
-    axes = fig.subplots(3, 1, sharex=True)
+    fig, axes = panel_grid(3, height_in=5.4, legend=True, titles=True)
+    axes = axes[:, 0]
     stamps = result.observations.sensor_timestamp_ns
     axes[0].set_title("Frames: time between stamps, less whole frame periods")
     if len(stamps) > 2:
@@ -92,7 +90,7 @@ def timing_figure(result: RunResult, figures: KeyFigures) -> Figure:
         periods = np.rint(steps_ns / figures.frame_period_ns)
         off_us = (steps_ns - periods * figures.frame_period_ns) / 1000
         whole = periods == 1
-        axes[0].plot(axis.s(stamps[1:])[whole], off_us[whole], ".", ms=3, mew=0, color=OPTICAL)
+        dots(axes[0], axis.s(stamps[1:])[whole], off_us[whole], size_pt=1.8, color=OPTICAL)
         gaps_s = axis.s(stamps[1:])[periods > 1]
         if len(gaps_s):
             axes[0].plot(gaps_s, off_us[periods > 1], "x", color=IMPACT, ms=5, label="after dropped frames")
@@ -106,7 +104,7 @@ def timing_figure(result: RunResult, figures: KeyFigures) -> Figure:
     if late_us is None or result.imu is None:
         _say(axes[1], "no inertial samples")
     else:
-        axes[1].plot(axis.s(result.imu.t_ns), late_us / 1000, ".", ms=2, mew=0, color=FUSED)
+        dots(axes[1], axis.s(result.imu.t_ns), late_us / 1000, size_pt=1.2, color=FUSED)
         axes[1].set_ylabel("after slot, ms")
         if np.nanmin(late_us, initial=0.0) >= 0:
             axes[1].set_ylim(bottom=0)
@@ -115,7 +113,7 @@ def timing_figure(result: RunResult, figures: KeyFigures) -> Figure:
     if fit is None:
         _say(axes[2], "no edges, or no line through them")
     else:
-        axes[2].plot(axis.s(fit.edges_ns), fit.residual_ns / 1000, ".", ms=1.6, mew=0, color=TRUTH)
+        dots(axes[2], axis.s(fit.edges_ns), fit.residual_ns / 1000, size_pt=1.1, color=TRUTH)
         missed_s = axis.s(fit.time_of_index(fit.missed_index))
         if len(missed_s):
             axes[2].plot(missed_s, np.zeros(len(missed_s)), "|", color=IMPACT, ms=9, label="missed edge")
@@ -125,7 +123,6 @@ def timing_figure(result: RunResult, figures: KeyFigures) -> Figure:
         axes[2].set_ylabel("residual, us")
     figure_legend(fig, axes)
     axes[2].set_xlabel(axis.label)
-    fig.align_ylabels()
     return fig
 
 
@@ -140,27 +137,6 @@ def imu_lateness_us(result: RunResult) -> FloatArray | None:
         after_ns = np.where(after_ns > grid.period_ns // 2, after_ns - grid.period_ns, after_ns)
     usable = result.imu.flags & int(UNUSABLE) == 0
     return np.asarray(np.where(usable, after_ns / 1000.0, np.nan))
-
-
-def overlay_figure(overlay: FrameOverlay) -> Figure:
-    """Return a decoded frame with rings where LEDs were seen and crosses where the pose puts them."""
-    rows, columns = overlay.image.shape[:2]
-    # Plots of the picture alone need no more pixels than a page shows.
-    step = max(1, columns // 960)
-    fig = Figure(figsize=(4.2, 4.2 * rows / columns + 0.25))
-    ax = fig.subplots()
-    ax.imshow(
-        overlay.image[::step, ::step], cmap="gray", vmin=0, vmax=255, interpolation="antialiased",
-        extent=(-0.5, columns - 0.5, rows - 0.5, -0.5),
-    )  # fmt: skip
-    seen, predicted = overlay.detected_uv_px, overlay.predicted_uv_px
-    ax.plot(seen[:, 0], seen[:, 1], "o", ms=11, mfc="none", mec="#ffb000", mew=1.2)
-    ax.plot(predicted[:, 0], predicted[:, 1], "+", ms=9, mec="#00c2ff", mew=1.2)
-    ax.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[])
-    ax.grid(visible=False)
-    ax.spines[:].set_visible(False)
-    ax.set_title(overlay.title)
-    return fig
 
 
 def alignment_figure(result: RunResult, *, imu_minus_camera_ns: int = 0) -> Figure | None:
@@ -190,8 +166,8 @@ def alignment_figure(result: RunResult, *, imu_minus_camera_ns: int = 0) -> Figu
     mean_dps = _means_over(gyro_s, gyro_dps, bounds)
     offset = np.nanmedian(mean_dps - optical_dps, axis=0) if np.isfinite(optical_dps).any() else np.zeros(3)
     fastest = middle_s[np.nanargmax(np.nansum(optical_dps**2, axis=1))]
-    fig = Figure(figsize=(WIDTH_IN, 3.9))
-    axes = fig.subplots(2, 3, sharex="row", gridspec_kw={"height_ratios": [1.5, 1]})
+    fig, axes = panel_grid(2, 3, height_in=3.9, legend=True, titles=True, share_x="row",
+                           labelled_columns=False, heights=[1.5, 1])  # fmt: skip
     near = (gyro_s > fastest - 0.5) & (gyro_s < fastest + 0.5)
     near_frames = (middle_s > fastest - 0.5) & (middle_s < fastest + 0.5)
     difference = mean_dps - offset - optical_dps
@@ -202,7 +178,7 @@ def alignment_figure(result: RunResult, *, imu_minus_camera_ns: int = 0) -> Figu
         top.plot(gyro_s[near], gyro_dps[near, i] - offset[i], color=FUSED, label="gyroscope less bias")
         top.plot(middle_s[near_frames], optical_dps[near_frames, i], "o", ms=3, mew=0, color=OPTICAL,
                  label="optical, frame to frame")  # fmt: skip
-        low.plot(middle_s, difference[:, i], ".", ms=2.2, mew=0, color=INK)
+        dots(low, middle_s, difference[:, i], size_pt=1.1, color=INK)
         low.set_ylim(-limit, limit)
         low.set_xlabel("time, s")
     axes[0, 0].set_ylabel("rate, deg/s")
@@ -213,35 +189,33 @@ def alignment_figure(result: RunResult, *, imu_minus_camera_ns: int = 0) -> Figu
 
 def calibration_figure(calibration: CalibrationPicture, uv_px: FloatArray | None = None) -> Figure:
     """Return the region that calibration dots covered, their residuals, and where the LEDs were."""
-    fig = Figure(figsize=(6.6, 4.1))
-    ax = fig.subplots()
+    fig, ax = picture_axes(calibration.width_px, calibration.height_px, below_in=0.25)
     for n, outline in enumerate(calibration.covered_uv_px):
         ax.add_patch(Polygon(outline, closed=True, fc="#dce8dd", ec=TRUTH, lw=0.9, alpha=0.8, zorder=0,
                              label="covered by dots" if n == 0 else None))  # fmt: skip
-    dots = calibration.dots_uv_px
-    if len(dots):
-        ax.plot(dots[:, 0], dots[:, 1], ".", ms=2, mew=0, color=INK, label="dots")
+    on_target = calibration.dots_uv_px
+    if len(on_target):
+        dots(ax, on_target[:, 0], on_target[:, 1], size_pt=1.0, color=INK, label="dots")
     residual = calibration.residual_um
     if residual is not None and np.isfinite(residual).any():
         size = np.hypot(residual[:, 0], residual[:, 1])
         typical = float(np.nanmedian(size))
         if typical > 0:
-            ax.quiver(dots[:, 0], dots[:, 1], residual[:, 0], residual[:, 1], angles="xy", scale_units="xy",
+            ax.quiver(*on_target.T, *residual.T, angles="xy", scale_units="xy",
                       scale=typical / 28, width=0.0018, color=OPTICAL, zorder=3)  # fmt: skip
             ax.set_title(f"dots and their residuals, median {typical:.1f} um on the target")
     if uv_px is not None:
         uv = uv_px.reshape(-1, 2)
-        ax.plot(uv[:, 0], uv[:, 1], ".", ms=1.5, mew=0, color=FUSED, label="LEDs of this run")
-    _picture_axes(ax, calibration.width_px, calibration.height_px)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, markerscale=4)
+        dots(ax, uv[:, 0], uv[:, 1], size_pt=0.75, color=FUSED, label="LEDs of this run")
+    fig.legend(loc="lower center", ncols=3, markerscale=4, borderaxespad=0.1)
     return fig
 
 
 def truth_figure(result: RunResult, figures: KeyFigures, comparison: TruthComparison) -> Figure:
     """Return the errors against the truth over time, with the 95 % band that the covariances promise."""
     axis = TimeAxis.of(result)
-    fig = Figure(figsize=(WIDTH_IN, 7.4))
-    axes = fig.subplots(6, 1, sharex=True)
+    fig, axes = panel_grid(6, height_in=7.4, legend=True)
+    axes = axes[:, 0]
     for i, ax in enumerate(axes):
         mark_events(ax, axis, result, figures)
         for source, colour in (("optical", OPTICAL), ("fused", FUSED)):
@@ -251,17 +225,16 @@ def truth_figure(result: RunResult, figures: KeyFigures, comparison: TruthCompar
             t_s = axis.s(series.t_ns)
             if source == "fused":
                 half = 1.96 * series.sd[:, i]
-                ax.fill_between(t_s, -half, half, color=FUSED, alpha=0.18, lw=0, label="promised 95 %")
-                ax.plot(t_s, series.error[:, i], color=colour, lw=0.8, label="fused")
+                band(ax, t_s, -half, half, color=FUSED, alpha=0.18, label="promised 95 %")
+                line(ax, t_s, series.error[:, i], color=colour, lw=0.8, label="fused")
             else:
-                ax.plot(t_s, series.error[:, i], ".", ms=2.2, mew=0, color=colour, label="optical")
+                dots(ax, t_s, series.error[:, i], size_pt=1.4, color=colour, label="optical")
         ax.set_ylabel(f"{COMPONENTS[i]}, {'deg' if i > 2 else 'mm'}")
         errors = [s.error[:, i] for s in comparison.series.values()]
         limit = _limit(np.concatenate(errors), 0.02)
         ax.set_ylim(-limit, limit)
     figure_legend(fig, axes)
     axes[-1].set_xlabel(axis.label)
-    fig.align_ylabels()
     return fig
 
 
@@ -280,13 +253,6 @@ def _limit(values: FloatArray, least: float) -> float:
     """Return a symmetric axis limit that shows all but rare outliers."""
     known = np.abs(values[np.isfinite(values)])
     return max(least, 1.25 * float(np.percentile(known, 99.5))) if known.size else least
-
-
-def _picture_axes(ax: Axes, width: int, height: int) -> None:
-    ax.set(
-        xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="u, px", ylabel="v, px", aspect="equal"
-    )
-    ax.spines[:].set_visible(True)
 
 
 def _say(ax: Axes, words: str) -> None:

@@ -1,15 +1,13 @@
 """The sections of a run's report: words, tables and embedded figures, ready for the template."""
 
-import base64
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting import quality_plots
+from bricktrack_host.reporting.embedding import EmbeddedFigure, embed_figure, embed_overlay
 from bricktrack_host.reporting.plots import (
     CalibrationPicture,
     FrameOverlay,
@@ -20,9 +18,6 @@ from bricktrack_host.reporting.plots import (
 from bricktrack_host.results.result_store import DetailValue, RunResult
 from bricktrack_host.results.run_summary import KeyFigures, main_track
 from bricktrack_host.results.truth import COMPONENTS, GroupErrors, TruthComparison
-
-_SMALL_BYTES = 150_000  # an SVG below this is kept without trying the other
-_PNG_DPI = 190  # sharp on a screen of twice the usual density at the page's width
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +35,6 @@ class ReportExtras:
     overlays: Sequence[FrameOverlay] = ()
     calibration: CalibrationPicture | None = None
     truth: TruthComparison | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class EmbeddedFigure:
-    """A figure as a data URI with its caption."""
-
-    uri: str
-    alt: str
-    caption: str = ""
-    half: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +70,9 @@ def report_sections(result: RunResult, figures: KeyFigures, extras: ReportExtras
         sections.append(_residual_section(result))
     if extras.overlays:
         words = "Rings: where an LED was seen. Crosses: where the pose puts it."
-        shown = [
-            _embed(quality_plots.overlay_figure(o), f"LEDs laid over {o.title}") for o in extras.overlays
-        ]
+        shown = [embed_overlay(o) for o in extras.overlays]
         sections.append(Section("pictures", "LEDs in the pictures", [words], shown, overlays=True))
-    timing = _embed(
+    timing = embed_figure(
         quality_plots.timing_figure(result, figures),
         "Frame intervals, lateness of inertial slots, residuals of the square wave's edges",
     )
@@ -104,7 +87,9 @@ def report_sections(result: RunResult, figures: KeyFigures, extras: ReportExtras
         caption = (
             "Rays outside the covered region are extrapolated; poses that use one are flagged uncovered."
         )
-        calibration.figures.append(_embed(picture, "Region covered by calibration dots", caption, half=True))
+        calibration.figures.append(
+            embed_figure(picture, "Region covered by calibration dots", caption, half=True)
+        )
     if calibration.tables or calibration.figures:
         sections.append(calibration)
     return sections
@@ -120,7 +105,7 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
         )
     else:
         words = "No rest pose: position of the first LED and rotation vector in the camera frame."
-    whole = _embed(
+    whole = embed_figure(
         motion_figure(result, figures), "Time histories of three displacements and three rotations",
         "Line: fused motion, 95 % band. Dots: optical poses. Shaded: no optical pose used. Red: impacts.",
     )  # fmt: skip
@@ -128,13 +113,13 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
     span = _closeup(result, figures)
     if span is not None:
         section.figures.append(
-            _embed(motion_figure(result, figures, span_s=span), "Close-up of the time histories",
+            embed_figure(motion_figure(result, figures, span_s=span), "Close-up of the time histories",
                    "Close-up around the highest speed. Bars: 95 % of each optical pose.")
         )  # fmt: skip
     spectrum = spectrum_figure(result)
     if spectrum is not None:
         section.figures.append(
-            _embed(
+            embed_figure(
                 spectrum,
                 "Spectra of displacement and rotation",
                 "Amplitude density of the fused motion. Dotted: half the frame rate.",
@@ -173,10 +158,12 @@ def _residual_section(result: RunResult) -> Section:
     head = ["LED", "frames used", "mean u, px", "mean v, px", "rms u, px", "rms v, px", "largest, px"]
     section.tables.append(SectionTable("", head, rows, 1))
     section.figures = [
-        _embed(quality_plots.residual_time_figure(result), "Residuals of each LED over time",
-               "Crosses at the border: beyond the axis."),
-        _embed(quality_plots.residual_picture_figure(result), "LEDs in the picture with their mean residuals",
-               "Where the LEDs were in the picture; arrows: mean residual of each, enlarged.", half=True),
+        embed_figure(quality_plots.residual_time_figure(result), "Residuals of each LED over time",
+                     "Crosses at the border: beyond the axis."),
+        embed_figure(quality_plots.residual_picture_figure(result),
+                     "LEDs in the picture with their mean residuals",
+                     "Where the LEDs were in the picture; arrows: mean residual of each, enlarged.",
+                     half=True),
     ]  # fmt: skip
     return section
 
@@ -213,7 +200,7 @@ def _alignment_section(result: RunResult) -> list[Section]:
         rows = [[in_words(name), value_text(value)] for name, value in result.alignment.items()]
         section.tables.append(SectionTable("", ["", ""], rows, 2))
     if figure is not None:
-        section.figures.append(_embed(
+        section.figures.append(embed_figure(
             figure, "Angular rates of gyroscope and optics",
             "Above: the second in which the brick turns fastest. Below: the gyroscope's mean between two "
             "frames, less bias, less the optical rate; what follows the motion there is a time offset.",
@@ -249,24 +236,10 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
             )
         )
     section.figures.append(
-        _embed(quality_plots.truth_figure(result, figures, truth), "Errors against the truth over time",
+        embed_figure(quality_plots.truth_figure(result, figures, truth), "Errors against the truth over time",
                "Band: what the fused covariances promise, 95 %. The tables hold errors beyond the axes.")
     )  # fmt: skip
     return section
-
-
-def _embed(figure: Figure, alt: str, caption: str = "", *, half: bool = False) -> EmbeddedFigure:
-    """Return the figure as a data URI: SVG, or PNG where that is smaller."""
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # the layout is found; finding it again takes most of a save's time
-    svg, png = io.BytesIO(), io.BytesIO()
-    figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-    kind, data = "svg+xml", svg.getvalue()
-    if len(data) > _SMALL_BYTES:
-        figure.savefig(png, format="png", dpi=_PNG_DPI, metadata={"Software": None})
-        if png.tell() < len(data):
-            kind, data = "png", png.getvalue()
-    return EmbeddedFigure(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", alt, caption, half)
 
 
 def in_words(name: str) -> str:
