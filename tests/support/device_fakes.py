@@ -42,7 +42,7 @@ class FakeBus:
         self.pages[0][:] = bytes(256)
         self.pages[0][0x00] = self.chip_id
         self.pages[0][0x34:0x37] = bytes((25, 0xFF, 0x0F))
-        self.pages[0][0x3B] = 0x80
+        self.pages[0][0x3B], self.pages[0][0x41] = 0x80, 0x24
         self.pages[1][:] = bytes(256)
         self.pages[1][0x08], self.pages[1][0x0A] = 0x0D, 0x38
         self.pages[1][0x50:0x60] = bytes(range(16))
@@ -60,9 +60,10 @@ class FakeBus:
     def writeto(self, address: int, buffer: bytes, *, start: int = 0, end: int | None = None) -> None:
         self._answer(address)
         data = bytes(buffer)[start:end]
-        if len(data) < 2:
-            return
-        register, value = data[0], data[1]
+        for register, value in enumerate(data[1:], start=data[0] if data else 0):
+            self._write(register, value)
+
+    def _write(self, register: int, value: int) -> None:
         if register == 0x07:
             self.page = value & 1
         elif self.page == 0 and register == 0x3F and value & 0x20:
@@ -132,12 +133,19 @@ class FakeCamera:
     """Emits small packets on CLOCK_MONOTONIC from its own thread."""
 
     def __init__(
-        self, *, period_us: int = 33_327, iperiod: int = 6, fail: str = "", silent_after: int | None = None
+        self,
+        *,
+        period_us: int = 33_327,
+        iperiod: int = 6,
+        fail: str = "",
+        silent_after: int | None = None,
+        n_bytes: int = 9,
     ) -> None:
         self.period_us = period_us
         self.iperiod = iperiod
         self.fail = fail
         self.silent_after = silent_after
+        self.n_bytes = n_bytes
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self.n_stops = 0
@@ -167,7 +175,7 @@ class FakeCamera:
                 self._stop.wait()
                 return
             sink.on_metadata(FrameMetadata(t_ns, 2000, 1.0, self.period_us))
-            data = b"\0\0\0\1\x65" + n.to_bytes(4, "big")
+            data = (b"\0\0\0\1\x65" + n.to_bytes(4, "big")).ljust(self.n_bytes, b"\x5a")
             sink.on_packet(EncodedPacket(t_ns // 1000, n % self.iperiod == 0, data))
             t_ns += self.period_us * 1000
             n += 1

@@ -1,0 +1,63 @@
+"""A whole unit that needs next to no processor: the real daemon on a camera without pictures, as a program.
+
+``python light_unit.py STORAGE`` arms itself, is triggered by a wave of its own soon after, records for half a
+second, saves and arms itself again, until it is ended. Its video has the size that a real one has.
+"""
+
+import logging
+import sys
+import threading
+import time
+from pathlib import Path
+
+from device_fakes import FakeBusOpener, FakeCamera, FakeRig
+
+from bricktrack_device.config import (
+    DeviceConfig,
+    ImuTable,
+    RecordingTable,
+    SamplerTable,
+    ServerTable,
+    StorageTable,
+    TriggerTable,
+    UnitTable,
+)
+from bricktrack_device.daemon import Daemon
+
+PICTURE_BYTES = 50_000  # 12 Mbit/s at 30 pictures a second
+DURATION_S = 0.5
+
+
+def light_config(storage: Path) -> DeviceConfig:
+    """Return what such a unit is told."""
+    return DeviceConfig(
+        unit=UnitTable(name="light"),
+        storage=StorageTable(folder=str(storage), margin_mb=1),
+        server=ServerTable(port=0),
+        trigger=TriggerTable(nominal_hz=100.0),
+        recording=RecordingTable(
+            duration_s=DURATION_S, pre_roll_s=0.1, post_roll_s=0.1, auto_arm=True, label="light"
+        ),
+        imu=[ImuTable(name="brick", bus="a")],
+        sampler=SamplerTable(priority=0, lock_memory=False),
+    )
+
+
+class SelfDrivenRig(FakeRig):
+    """A fake rig whose wave begins by itself 0.1 s after arming and lasts longer than the run."""
+
+    def __init__(self) -> None:
+        super().__init__(camera=FakeCamera(n_bytes=PICTURE_BYTES), buses={"a": FakeBusOpener(fail_every=40)})
+
+    def on_armed(self, t_armed_ns: int) -> None:
+        super().on_armed(t_armed_ns)
+        threading.Thread(target=self._drive, daemon=True).start()
+
+    def _drive(self) -> None:
+        time.sleep(0.1)
+        self.pulse(round(1.5 * DURATION_S * 100), half_period_s=0.005)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
+    Daemon(light_config(Path(sys.argv[1])), SelfDrivenRig()).run()
