@@ -20,7 +20,7 @@ _NOISE_BANDWIDTH = 1.22  # of a critically damped second-order low-pass over its
 _MAG_FIELD_CAMERA_UT = np.array([18.0, 43.0, -4.0])
 _MAG_NOISE_UT = 0.3
 _CLOCK_SD = 2e-3  # an internal oscillator; measure on hardware
-_TAPS_A_CONSTANT, _LENGTH_IN_CONSTANTS = 12, 12
+_TAPS_A_CONSTANT, _LENGTH_IN_CONSTANTS = 8, 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,11 +111,12 @@ class ImuSensors:
         world = self._world
         if self._on_camera:
             return -world.gravity_camera_mps2, np.zeros(3), np.eye(3)
-        delays, weights = low_pass_taps(ACC_LAG_S * ACC_BANDWIDTH_HZ / setup.acc_bandwidth_hz)
-        acc = weights @ world.specific_force(since_s - delays)
-        delays, weights = low_pass_taps(GYRO_LAG_S * GYRO_BANDWIDTH_HZ / setup.gyro_bandwidth_hz)
-        gyro = weights @ world.angular_rate(since_s - delays)
-        return acc, np.rad2deg(gyro), world.R_camera_imu(np.array([since_s]))[0]
+        acc_delays, acc_weights = low_pass_taps(ACC_LAG_S * ACC_BANDWIDTH_HZ / setup.acc_bandwidth_hz)
+        gyro_delays, gyro_weights = low_pass_taps(GYRO_LAG_S * GYRO_BANDWIDTH_HZ / setup.gyro_bandwidth_hz)
+        ideal = world.inertial(since_s - np.concatenate([acc_delays, gyro_delays, [0.0]]))
+        n = len(acc_delays)
+        gyro = gyro_weights @ ideal.omega_radps[n:-1]
+        return acc_weights @ ideal.specific_force_mps2[:n], np.rad2deg(gyro), ideal.R_camera_imu[-1]
 
 
 def noise_sds(setup: SensorSetup) -> tuple[float, float]:

@@ -157,7 +157,8 @@ class _WithImpacts:
 
     def __call__(self, t_s: FloatArray) -> Derivatives:
         value, rate, second = self.base(t_s)
-        for t0, width, kick in zip(self.t_impact_s, self.width_s, self.kick, strict=True):
+        felt = (self.t_impact_s < t_s.max()) & (self.t_impact_s > t_s.min() - _IMPACT_GONE_S)
+        for t0, width, kick in zip(self.t_impact_s[felt], self.width_s[felt], self.kick[felt], strict=True):
             rows = np.flatnonzero((t_s > t0) & (t_s < t0 + _IMPACT_GONE_S))
             if rows.size == 0:
                 continue

@@ -6,6 +6,7 @@ shared between processes, because arming decides it.
 
 import math
 import multiprocessing
+from dataclasses import dataclass
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel, brick_model_from_file, load_brick_model
 from bricktrack_common.errors import ConfigError
-from bricktrack_common.rotations import matrix_from_rvec, right_jacobian
+from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_device.sim.motions import make_motion
 from bricktrack_device.sim.paper_layout import PAPER_LAYOUT
 from bricktrack_device.sim.settings import SimSettings
@@ -31,6 +32,21 @@ def make_epoch() -> "Epoch[int]":
     """Return the shared instant of the first edge, not yet set; a spawned process takes it as an argument."""
     epoch: Epoch[int] = multiprocessing.get_context("spawn").Value("q", 0)
     return epoch
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inertial:
+    """What ideal inertial sensors feel, in their own axes.
+
+    Attributes
+    ----------
+    specific_force_mps2, omega_radps : ndarray, shape (n, 3)
+    R_camera_imu : ndarray, shape (n, 3, 3)
+    """
+
+    specific_force_mps2: FloatArray
+    omega_radps: FloatArray
+    R_camera_imu: FloatArray
 
 
 class SimWorld:
@@ -96,30 +112,17 @@ class SimWorld:
     def twist(self, t_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the angular rate in brick axes, rad/s, and the origin's velocity in camera axes, mm/s."""
         q, dq, _ = self._coordinates(self.since_first_edge_s(t_ns))
-        return _omega(q, dq), dq[:, :3]
+        return angular_rate_and_acceleration(q[:, 3:], dq[:, 3:], np.zeros_like(dq[:, 3:]))[0], dq[:, :3]
 
-    def specific_force(self, since_s: FloatArray) -> FloatArray:
-        """Return what an ideal accelerometer at the lever arm feels, m/s^2, its axes, shape (n, 3).
-
-        ``since_s``, shape (n,), counts from the first edge.
-        """
+    def inertial(self, since_s: FloatArray) -> Inertial:
+        """Return what ideal sensors at the lever arm feel at times (n,) after the first edge, s."""
         q, dq, ddq = self._coordinates(since_s)
         omega, alpha = angular_rate_and_acceleration(q[:, 3:], dq[:, 3:], ddq[:, 3:])
         R = self._R_rest @ matrix_from_rvec(q[:, 3:])
-        lever_arm_m = np.broadcast_to(self._lever_arm_mm * 1e-3, omega.shape)
-        swing = np.cross(alpha, lever_arm_m) + np.cross(omega, np.cross(omega, lever_arm_m))
+        arm_m = self._lever_arm_mm * 1e-3
+        swing = _cross(alpha, arm_m) + _cross(omega, _cross(omega, arm_m))
         force = np.einsum("nji,nj->ni", R, ddq[:, :3] * 1e-3 - _GRAVITY_CAMERA_MPS2) + swing
-        return np.asarray(force @ self._R_brick_imu)
-
-    def angular_rate(self, since_s: FloatArray) -> FloatArray:
-        """Return what an ideal gyroscope feels, rad/s, IMU axes, shape (n, 3)."""
-        q, dq, _ = self._coordinates(since_s)
-        return np.asarray(_omega(q, dq) @ self._R_brick_imu)
-
-    def R_camera_imu(self, since_s: FloatArray) -> FloatArray:  # noqa: N802
-        """Return the sensor's orientation, shape (n, 3, 3)."""
-        q, _, _ = self._coordinates(since_s)
-        return np.asarray(self._R_rest @ matrix_from_rvec(q[:, 3:]) @ self._R_brick_imu)
+        return Inertial(force @ self._R_brick_imu, omega @ self._R_brick_imu, R @ self._R_brick_imu)
 
     def card_cover(self, t_ns: IntArray) -> FloatArray:
         """Return how far the opaque card has slid before the lens: 0 away, 1 hides everything.
@@ -163,8 +166,11 @@ def load_layout(settings: SimSettings) -> BrickModel:
     return brick_model_from_file(PAPER_LAYOUT, where="the simulated brick")
 
 
-def _omega(q: FloatArray, dq: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nij,nj->ni", right_jacobian(q[:, 3:]), dq[:, 3:]))
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the cross product along the last axis; for a few hundred `numpy.cross` takes far longer."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
 
 
 def angular_rate_and_acceleration(
@@ -178,10 +184,10 @@ def angular_rate_and_acceleration(
     s2 = np.sum(rvec_rad * rvec_rad, axis=-1, keepdims=True)
     ds2 = 2 * np.sum(rvec_rad * rate, axis=-1, keepdims=True)
     (a, da), (b, db) = (_series(s2, first) for first in (2, 3))
-    cross = np.cross(rvec_rad, rate)
-    twice = np.cross(rvec_rad, cross)
-    cross_rate = np.cross(rvec_rad, second)
-    twice_rate = np.cross(rate, cross) + np.cross(rvec_rad, cross_rate)
+    cross = _cross(rvec_rad, rate)
+    twice = _cross(rvec_rad, cross)
+    cross_rate = _cross(rvec_rad, second)
+    twice_rate = _cross(rate, cross) + _cross(rvec_rad, cross_rate)
     omega = rate - a * cross + b * twice
     alpha = second - a * cross_rate - da * ds2 * cross + b * twice_rate + db * ds2 * twice
     return np.asarray(omega), np.asarray(alpha)

@@ -49,8 +49,8 @@ def test_an_impact_passes_the_filter_as_scipy_s_does() -> None:
     world, chip = sensors(settings)
     t = np.arange(0, 3.5, 1e-4)  # the first impacts
     for lag_s, signal, channel in (
-        (ACC_LAG_S, world.specific_force(t), "acc"),
-        (GYRO_LAG_S, np.rad2deg(world.angular_rate(t)), "gyro"),
+        (ACC_LAG_S, world.inertial(t).specific_force_mps2, "acc"),
+        (GYRO_LAG_S, np.rad2deg(world.inertial(t).omega_radps), "gyro"),
     ):
         tau = lag_s / 2
         low_pass = lti([1.0], [tau**2, 2 * tau, 1.0])

@@ -32,7 +32,7 @@ def test_the_gyroscope_feels_the_turning_of_the_poses() -> None:
     before, after = (Rotation.from_matrix(world.pose(t_ns + s)[0]) for s in (-h_ns, h_ns))
     expected = (before.inv() * after).as_rotvec() / (2 * h_ns * 1e-9)
     # h^2/6 of the third derivative, 2 rad/s at 20 Hz: 1e-6; the kit's sensor has the brick's axes.
-    np.testing.assert_allclose(world.angular_rate((t_ns - FIRST_NS) * 1e-9), expected, atol=1e-5)
+    np.testing.assert_allclose(world.inertial((t_ns - FIRST_NS) * 1e-9).omega_radps, expected, atol=1e-5)
     np.testing.assert_allclose(world.twist(t_ns)[0], expected, atol=1e-5)
 
 
@@ -51,7 +51,9 @@ def test_the_accelerometer_feels_its_own_way_through_space_and_gravity() -> None
     gravity = world.gravity_camera_mps2
     expected = np.einsum("nji,nj->ni", R, acceleration - gravity)
     # h^2/12 of the fourth derivative, 10 m/s^2 at 20 Hz: 5e-4 m/s^2.
-    np.testing.assert_allclose(world.specific_force((t_ns - FIRST_NS) * 1e-9), expected, atol=2e-3)
+    np.testing.assert_allclose(
+        world.inertial((t_ns - FIRST_NS) * 1e-9).specific_force_mps2, expected, atol=2e-3
+    )
     assert np.linalg.norm(gravity) == pytest.approx(9.80665) and gravity[1] > 9.7  # v points down
 
 
@@ -68,9 +70,11 @@ def test_at_rest_only_gravity_is_felt() -> None:
     R, _ = world.rest_pose
     at_rest = np.array([-1e3, -0.5, 0.2, 7.0])
     np.testing.assert_allclose(
-        world.specific_force(at_rest), np.tile(-R.T @ world.gravity_camera_mps2, (4, 1)), atol=1e-6
+        world.inertial(at_rest).specific_force_mps2,
+        np.tile(-R.T @ world.gravity_camera_mps2, (4, 1)),
+        atol=1e-6,
     )
-    np.testing.assert_allclose(world.angular_rate(at_rest), 0, atol=1e-9)
+    np.testing.assert_allclose(world.inertial(at_rest).omega_radps, 0, atol=1e-9)
 
 
 def test_rate_and_acceleration_of_large_rotation_vectors_are_scipy_s() -> None:
