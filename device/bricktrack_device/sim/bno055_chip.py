@@ -5,6 +5,7 @@ Register numbers and codes are those of the data sheet BST-BNO055-DS000.
 
 import struct
 from collections.abc import Callable
+from concurrent.futures import Executor, Future
 
 import numpy as np
 
@@ -47,15 +48,24 @@ class Bno055Chip:
         Returns what the sensors measure at an instant, ns, with a `SensorSetup`, in the chip's own axes.
     period_s : float
         Between samples.
+    ahead : Executor or None
+        Works out the next sample while nobody reads, so that a read takes no longer than its bus.
     """
 
     def __init__(
-        self, unique_id: bytes, measure: Callable[[int, SensorSetup], Measured], *, period_s: float
+        self,
+        unique_id: bytes,
+        measure: Callable[[int, SensorSetup], Measured],
+        *,
+        period_s: float,
+        ahead: Executor | None = None,
     ) -> None:
         self._unique_id = unique_id
         self._measure = measure
         self._period_ns = period_s * 1e9
         self._silent_until_ns = 0
+        self._ahead = ahead
+        self._next: tuple[int, Future[bytes]] | None = None
         self._latest: tuple[int, bytes] = (-1, bytes(N_SAMPLE_BYTES))
         self.power_up(0)
 
@@ -77,6 +87,7 @@ class Bno055Chip:
         self._page1[_ACC_CONFIG], self._page1[0x09], self._page1[_GYRO_CONFIG] = 0x0D, 0x6D, 0x38
         self._page1[0x50:0x60] = self._unique_id
         self._on_page_1 = False
+        self._next = None
         self._mode_since_ns = t_ns
 
     def answers(self, t_ns: int) -> bool:
@@ -114,6 +125,7 @@ class Bno055Chip:
         if mode in _FUSION_MODES:  # fusion owns ranges and bandwidths
             self._page1[_ACC_CONFIG], self._page1[_GYRO_CONFIG] = _FUSION_ACC_CONFIG, _FUSION_GYRO_CONFIG
         self._mode_since_ns = t_ns
+        self._next = None
         self._latest = -1, bytes(N_SAMPLE_BYTES)
 
     def read(self, register: int, n_bytes: int, t_ns: int) -> bytes:
@@ -132,7 +144,13 @@ class Bno055Chip:
             return bytes(N_SAMPLE_BYTES)
         k = int((t_ns - first_ns) / self._period_ns)
         if k != self._latest[0]:
-            self._latest = k, self._registers(first_ns + round(k * self._period_ns))
+            if self._next is not None and self._next[0] == k:
+                self._latest = k, self._next[1].result()
+            else:
+                self._latest = k, self._registers(first_ns + round(k * self._period_ns))
+            if self._ahead is not None:
+                next_ns = first_ns + round((k + 1) * self._period_ns)
+                self._next = k + 1, self._ahead.submit(self._registers, next_ns)
         return self._latest[1]
 
     def _registers(self, t_ns: int) -> bytes:

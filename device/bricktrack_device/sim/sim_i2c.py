@@ -3,6 +3,7 @@
 import errno
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from zlib import crc32
 
@@ -52,10 +53,12 @@ class SimI2c:
         self._faults = world.settings.faults
         stream = bus_stream(bus)
         sensors = ImuSensors(world, on_camera=bus in world.settings.imu.on_camera, stream=stream)
+        self._ahead = ThreadPoolExecutor(1, thread_name_prefix="sim-imu")
         self.chip = Bno055Chip(
             np.random.default_rng([world.settings.seed, 10, stream]).bytes(16),
             sensors.measure,
             period_s=chip_period_s(world.settings, stream),
+            ahead=self._ahead,
         )
         self._locked = False
         self._pointer = 0
@@ -110,6 +113,7 @@ class SimI2c:
 
     def close(self) -> None:
         """Release the bus."""
+        self._ahead.shutdown(wait=False, cancel_futures=True)
 
     @staticmethod
     def _duration_s(n_bytes: int) -> float:
