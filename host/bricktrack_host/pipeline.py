@@ -49,7 +49,14 @@ from bricktrack_host.results.result_store import (
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.results.true_motion import read_true_motion
 from bricktrack_host.results.truth import TruthComparison, compare_with_truth
-from bricktrack_host.tracking.optical_track import SegmentMethod, led_motion, observe_leds, solve_poses
+from bricktrack_host.tracking.first_poses import FirstPoses
+from bricktrack_host.tracking.optical_track import (
+    SegmentMethod,
+    led_motion,
+    observe_leds,
+    solve_poses,
+    start_poses,
+)
 from bricktrack_host.tracking.segment import Picture, Plane
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
@@ -178,12 +185,9 @@ def process_run(
         observations = pictures.observe(rays.ray_model, brick, settings.segmentation, stages.progress)
     problems += pictures.problems()
     with stages("solve poses"):
+        first = start_poses(observations, rays.ray_model, brick, form=settings.prsoi_form)
         optical = solve_poses(
-            observations,
-            rays.ray_model,
-            brick,
-            form=settings.prsoi_form,
-            rolling_shutter=settings.rolling_shutter,
+            observations, rays.ray_model, brick, rolling_shutter=settings.rolling_shutter, first=first
         )
     _require_poses(optical, run, brick)
     with stages("align clocks"):
@@ -193,7 +197,7 @@ def process_run(
         rest = _rest_pose(optical, imu, alignment, problems)
     with stages("fuse"):
         if settings.rolling_shutter:
-            optical = _retime(observations, optical, imu, alignment, rays.ray_model, brick)
+            optical = _retime(observations, first, optical, imu, alignment, rays.ray_model, brick)
             _require_poses(optical, run, brick)
         grid = _output_grid(optical, imu, alignment, edge_fit)
         fused, fusion = _fuse(optical, imu, alignment, brick, grid, problems)
@@ -418,6 +422,7 @@ def _output_grid(
 
 def _retime(
     observations: LedObservations,
+    first: FirstPoses,
     optical: OpticalTrack,
     imu: ImuTrack | None,
     alignment: TimeAlignment | None,
@@ -441,7 +446,7 @@ def _retime(
         except (ShapeError, TrackingError):
             return optical  # the fusion itself will say why
         motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)))
-        optical = solve_poses(observations, rays, brick, motion=motion)
+        optical = solve_poses(observations, rays, brick, motion=motion, first=first)
         if not np.isfinite(optical.t_camera_brick_mm).any():
             break
     return optical

@@ -1,12 +1,10 @@
-"""Which blob is which LED: three ways to a hypothesis, one way to believe it.
+"""Which blob is which LED, for any layout: by prediction, or from nothing.
 
 * `assign_predicted`: the track says where the LEDs should be; the pattern may have moved as a whole.
-* `paper_correspondence`: the source paper's rules for its seven-LED layout.
-* `search_correspondence`: any layout, from nothing: poses from triples of blobs and LEDs (`p3p`), ranked by
-  how many other LEDs fall on blobs.
+* `search_correspondence`: poses from triples of blobs and LEDs (`p3p`), ranked by how many other LEDs fall
+  on blobs.
 
-Whatever the way, `verify` fits a pose and keeps the LEDs whose blobs it explains. Where two assignments
-explain the picture equally well, that is the answer; none is chosen.
+`paper_rules` has the source paper's way for its own layout, `verification` what makes an answer believed.
 """
 
 from dataclasses import dataclass
@@ -15,66 +13,26 @@ from itertools import combinations, permutations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
+from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.p3p import ray_centre_mm, rays_of, solve_p3p
-from bricktrack_host.tracking.prsoi import PrsoiForm, prsoi_poses
-from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
 from bricktrack_host.tracking.segment import Blobs
+from bricktrack_host.tracking.verification import (
+    MIN_FACING,
+    MIN_INLIERS,
+    Correspondence,
+    blob_pixels,
+    identity_gate_px,
+    no_correspondence,
+    verified_correspondence,
+    verify,
+)
 
-MIN_INLIERS = 4
-_IDENTITY_SD_PX = 1.5
-"""Trust in a blob while identities are decided: far above centroid noise, so that rolling shutter and an
-unfitted profile do not refuse a true assignment, far below the distance between two LEDs."""
 _MAX_SEARCH_BLOBS = 12
-_MIN_FACING = 0.05
 _RIVAL_CHI2 = 12.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Correspondence:
-    """Identities in one picture, verified by a pose, or why there are none.
-
-    Attributes
-    ----------
-    blob_of_led : ndarray of int64, shape (n_leds,)
-        Index of the blob, -1 where the LED was not found.
-    R_camera_brick, t_camera_brick_mm : ndarray, shapes (3, 3) and (3,)
-        The pose that verified it; NaN where there is none.
-    rms_px : float
-        Of its residuals; NaN where there is none.
-    is_ambiguous : bool
-        Another assignment or pose fits as well.
-    reason : str
-        In words, why there is no assignment; empty where there is one.
-    """
-
-    blob_of_led: IntArray
-    R_camera_brick: FloatArray
-    t_camera_brick_mm: FloatArray
-    rms_px: float
-    is_ambiguous: bool
-    reason: str
-
-    @property
-    def n_found(self) -> int:
-        """Number of LEDs with a blob."""
-        return int((self.blob_of_led >= 0).sum())
-
-
-def no_correspondence(n_leds: int, reason: str, *, ambiguous: bool = False) -> Correspondence:
-    """Return the answer "none", with its reason."""
-    return Correspondence(
-        blob_of_led=np.full(n_leds, -1, dtype=np.int64),
-        R_camera_brick=np.full((3, 3), np.nan),
-        t_camera_brick_mm=np.full(3, np.nan),
-        rms_px=float("nan"),
-        is_ambiguous=ambiguous,
-        reason=reason,
-    )
 
 
 def assign_predicted(
@@ -130,181 +88,6 @@ def assign_predicted(
     return none
 
 
-def is_paper_layout(brick_model: BrickModel) -> bool:
-    """Tell whether the paper's rules apply: seven LEDs, of which 0, 3, 4, 5 stand in one line."""
-    if brick_model.n_leds != 7:
-        return False
-    column = brick_model.led_positions_mm[[0, 3, 4, 5]]
-    return bool(np.linalg.svd(column - column.mean(axis=0), compute_uv=False)[1] < 0.5)
-
-
-def paper_correspondence(points_mm: FloatArray, *, angle_limit_deg: float = 1.0) -> IntArray | None:
-    """Identify seven LEDs by the paper's rules.
-
-    Parameters
-    ----------
-    points_mm : array_like, shape (7, 2), mm
-        Hits of the blobs' rays on a calibrated plane: in raw pixels distortion bends the column.
-    angle_limit_deg : float
-        Largest deviation from 0 or 180 degrees between directions inside the column.
-
-    Returns
-    -------
-    blob_of_led : ndarray of int64, shape (7,), or None
-        `None` where not exactly one set of four blobs is in line. The rules can answer wrongly (4 % of
-        orientations with three simultaneous angles up to 45 degrees): verify the answer.
-    """
-    points = as_float_array("points_mm", points_mm, (7, 2))
-    columns = [c for c in combinations(range(7), 4) if _bend_deg(points[list(c)]) <= angle_limit_deg]
-    if len(columns) != 1:
-        return None
-    column = list(columns[0])
-    others = [i for i in range(7) if i not in column]
-    chebyshev = np.abs(points[:, None] - points[None]).max(axis=-1)
-    m6 = max(others, key=lambda i: float(chebyshev[i, others].sum()))
-    pair = [i for i in others if i != m6]
-    m1, m2 = sorted(pair, key=lambda i: float(chebyshev[i, column].min()))
-    m5 = max(column, key=lambda i: float(chebyshev[i, [m1, m2]].sum()))
-    m4, m3, m0 = sorted((i for i in column if i != m5), key=lambda i: float(chebyshev[i, m5]))
-    return np.array([m0, m1, m2, m3, m4, m5, m6], dtype=np.int64)
-
-
-def paper_hypotheses(blobs: Blobs, ray_model: RayModel) -> IntArray:
-    """Return what the paper's rules make of every choice of seven blobs, shape (n, 7); see `verify`.
-
-    The paper's filter lets a few reflections pass; its rules want seven points. More than ten blobs: none.
-    """
-    if not 7 <= len(blobs) <= 10:
-        return np.empty((0, 7), dtype=np.int64)
-    middle_mm = 0.5 * (ray_model.plane_a_mm + ray_model.plane_b_mm)
-    points = ray_model.points_on_plane(blobs.uv_px, middle_mm)
-    found = []
-    for chosen in combinations(range(len(blobs)), 7):
-        index = np.array(chosen, dtype=np.int64)
-        answer = paper_correspondence(points[index])
-        if answer is not None:
-            found.append(index[answer])
-    return np.array(found, dtype=np.int64).reshape(-1, 7)
-
-
-def _bend_deg(points: FloatArray) -> float:
-    """Return the largest angle, modulo 180 degrees, between the directions from the first point by u."""
-    ordered = points[np.lexsort((points[:, 1], points[:, 0]))]
-    d = ordered[1:] - ordered[0]
-    angles = np.degrees(np.arctan2(d[:, 1], d[:, 0]))
-    apart = np.abs(angles[:, None] - angles[None]) % 180.0
-    return float(np.minimum(apart, 180.0 - apart).max())
-
-
-def verify(
-    uv_px: FloatArray,
-    starts: tuple[FloatArray, FloatArray] | None,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    *,
-    collar_mm: float | None,
-    gate_px: float,
-) -> tuple[BoolArray, RefinedPoses]:
-    """Fit poses to assignments and keep the LEDs that each pose explains.
-
-    Parameters
-    ----------
-    uv_px : ndarray, shape (n, n_leds, 2), px
-        The blob of each LED under each hypothesis; NaN for none.
-    starts : (R, t) or None
-        Shapes (n, 3, 3) and (n, 3); `None`: by PRSOI.
-    gate_px : float
-        Largest residual that is believed.
-
-    Returns
-    -------
-    kept : ndarray of bool, shape (n, n_leds)
-        All false where fewer than four LEDs remain.
-    poses : RefinedPoses
-    """
-    uv = uv_px.copy()
-    n = len(uv)
-    R, t = starts if starts is not None else prsoi_starts(uv, ray_model, brick_model)
-    cov = np.broadcast_to(_IDENTITY_SD_PX**2 * np.eye(2), (n, brick_model.n_leds, 2, 2))
-    poses = refine_poses(uv, cov, R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=6)
-    for last in (False, False, True):
-        length = np.linalg.norm(poses.residual_px, axis=-1)
-        seen = all_finite(uv)
-        bad = seen & ~((length <= gate_px) & (poses.facing > _MIN_FACING))
-        rows = np.flatnonzero(bad.any(axis=1))
-        if rows.size == 0:
-            break
-        if last:
-            uv[rows] = np.nan
-            break
-        # One at a time, the worst: a false blob drags its neighbours' residuals with it.
-        worst = np.where(bad[rows], np.nan_to_num(length[rows], nan=np.inf), -1.0)
-        uv[rows, worst.argmax(axis=1)] = np.nan
-        again = refine_poses(
-            uv[rows],
-            cov[rows],
-            np.where(np.isfinite(poses.R_camera_brick[rows]), poses.R_camera_brick[rows], R[rows]),
-            np.where(np.isfinite(poses.t_camera_brick_mm[rows]), poses.t_camera_brick_mm[rows], t[rows]),
-            ray_model,
-            brick_model,
-            collar_mm=collar_mm,
-            max_steps=6,
-        )
-        poses = poses.replaced(rows, again)
-    kept = all_finite(uv)
-    kept[kept.sum(axis=1) < MIN_INLIERS] = False
-    return kept, poses
-
-
-def blob_pixels(blobs: Blobs, blob_of_led: IntArray) -> FloatArray:
-    """Return the blobs' centroids in the order of the LEDs, shape (..., n_leds, 2), NaN for none."""
-    return np.where((blob_of_led >= 0)[..., None], blobs.uv_px[np.maximum(blob_of_led, 0)], np.nan)
-
-
-def prsoi_starts(
-    uv_px: FloatArray, ray_model: RayModel, brick_model: BrickModel, form: PrsoiForm = "safe"
-) -> tuple[FloatArray, FloatArray]:
-    """Return the PRSOI poses, (n, 3, 3) and (n, 3), of centroids (n, n_leds, 2), NaN where unseen."""
-    a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
-    on_a, on_b = np.full_like(uv_px, np.nan), np.full_like(uv_px, np.nan)
-    seen = all_finite(uv_px)
-    on_a[seen] = ray_model.points_on_plane(uv_px[seen], a)
-    on_b[seen] = ray_model.points_on_plane(uv_px[seen], b)
-    found = prsoi_poses(on_a, on_b, brick_model.led_positions_mm, plane_a_mm=a, plane_b_mm=b, form=form)
-    return found.R_camera_brick, found.t_camera_brick_mm
-
-
-def _answer(blob_of_led: IntArray, poses: RefinedPoses, i: int) -> Correspondence:
-    r = poses.residual_px[i][blob_of_led >= 0]
-    return Correspondence(
-        blob_of_led=blob_of_led,
-        R_camera_brick=poses.R_camera_brick[i],
-        t_camera_brick_mm=poses.t_camera_brick_mm[i],
-        rms_px=float(np.sqrt(np.mean(np.sum(r**2, axis=-1)))),
-        is_ambiguous=False,
-        reason="",
-    )
-
-
-def identify_by_paper(
-    blobs: Blobs, ray_model: RayModel, brick_model: BrickModel, *, collar_mm: float | None, gate_px: float
-) -> Correspondence:
-    """Identify seven LEDs by the paper's rules and verify by reprojection."""
-    if not is_paper_layout(brick_model):
-        return no_correspondence(brick_model.n_leds, "not the paper's layout")
-    hypotheses = paper_hypotheses(blobs, ray_model)
-    if len(hypotheses) == 0:
-        return no_correspondence(brick_model.n_leds, "no seven blobs obey the paper's rules")
-    kept, poses = verify(
-        blob_pixels(blobs, hypotheses), None, ray_model, brick_model, collar_mm=collar_mm, gate_px=gate_px
-    )
-    whole = np.flatnonzero(kept.all(axis=1))
-    if len(whole) == 0:
-        return no_correspondence(brick_model.n_leds, "reprojection refutes the paper's rules")
-    best = int(whole[np.argmin(poses.chi2[whole])])
-    return _answer(hypotheses[best], poses, best)
-
-
 def search_correspondence(
     blobs: Blobs, ray_model: RayModel, brick_model: BrickModel, *, collar_mm: float | None
 ) -> Correspondence:
@@ -357,16 +140,7 @@ def search_correspondence(
             return no_correspondence(n_leds, "two assignments fit equally well", ambiguous=True)
     answer = kept[best].copy()
     answer[answer >= 0] = original[answer[answer >= 0]]
-    return _answer(answer, poses, best)
-
-
-def identity_gate_px(radius_px: float) -> float:
-    """Return the residual up to which a blob is believed to be its LED: a third of its radius, over 4 px.
-
-    An unfitted profile shifts centroids by up to a fifth of the radius, a rolling shutter by more at times;
-    LEDs are more than three radii apart.
-    """
-    return max(4.0, radius_px / 3)
+    return verified_correspondence(answer, poses, best)
 
 
 def _likeliest(blobs: Blobs) -> tuple[Blobs, IntArray]:
@@ -453,7 +227,7 @@ def _hypotheses(geometry: _Geometry, brick_model: BrickModel) -> tuple[FloatArra
         valid &= ~wrong.any(axis=-1)
     axes = np.einsum("nkij,nlj->nkli", R, brick_model.led_axes[led[il]])
     facing = -(axes * f[blob[ib]][:, None]).sum(axis=-1)
-    valid &= (facing > _MIN_FACING).all(axis=-1)
+    valid &= (facing > MIN_FACING).all(axis=-1)
     return R[valid], t[valid]
 
 

@@ -13,10 +13,10 @@ from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.tracking.correspondence import prsoi_starts
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_profile import predict_brick
 from bricktrack_host.tracking.led_tracker import NOT_USED
+from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
 from bricktrack_host.tracks import LedObservations
 

@@ -14,20 +14,14 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
-from bricktrack_host.tracking.correspondence import (
-    MIN_INLIERS,
-    Correspondence,
-    assign_predicted,
-    identify_by_paper,
-    identity_gate_px,
-    prsoi_starts,
-    search_correspondence,
-    verify,
-)
+from bricktrack_host.tracking.correspondence import assign_predicted, search_correspondence
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.paper_rules import identify_by_paper
+from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import RefinedPoses
 from bricktrack_host.tracking.segment import Blobs
+from bricktrack_host.tracking.verification import MIN_INLIERS, Correspondence, identity_gate_px, verify
 
 SegmentMethod = Literal["default", "paper"]
 

@@ -16,17 +16,16 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.tracking.correspondence import prsoi_starts
 from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.first_poses import FirstPoses, degrees_of_freedom, first_poses
 from bricktrack_host.tracking.led_identity import SegmentMethod
 from bricktrack_host.tracking.led_profile import collar_of
 from bricktrack_host.tracking.led_tracker import NOT_USED, observe_leds
-from bricktrack_host.tracking.p3p import ray_centre_mm, rays_of, solve_p3p
-from bricktrack_host.tracking.prsoi import PrsoiForm
+from bricktrack_host.tracking.prsoi import PrsoiForm, prsoi_starts
 from bricktrack_host.tracking.refine import MIN_LEDS, LedMotion, RefinedPoses, refine_poses
 from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
-__all__ = ["SegmentMethod", "led_motion", "led_times_ns", "observe_leds", "solve_poses"]
+__all__ = ["SegmentMethod", "led_motion", "led_times_ns", "observe_leds", "solve_poses", "start_poses"]
 
 _PASSES = 4
 _SETTLED_MM = 1e-3
@@ -36,9 +35,6 @@ _TWIST_FLOOR = np.array([0.005, 0.3])  # rad/s, mm/s: far below what moves a cen
 _FUSED_TWIST_SD = np.repeat([0.03, 5.0], 3)  # rad/s, mm/s: of the fused motion between frames
 _UNKNOWN_TWIST = np.array([1.0, 1.0, 1.0, 300.0, 300.0, 300.0])
 """Of a shaken brick (DESIGN 2: 0.3 m/s), where the neighbours do not say."""
-_DOUBT_CHI2_PER_DOF = 9.0
-_RIVAL_CHI2 = 9.0  # three sigma: below this two poses cannot be told apart
-_SAME_POSE_RAD = 0.02
 
 
 def led_times_ns(observations: LedObservations, ray_model: RayModel) -> tuple[IntArray, IntArray]:
@@ -63,6 +59,7 @@ def solve_poses(
     refined: bool = True,
     rolling_shutter: bool = True,
     motion: LedMotion | None = None,
+    first: FirstPoses | None = None,
 ) -> OpticalTrack:
     """Solve the poses of a run.
 
@@ -80,6 +77,8 @@ def solve_poses(
     motion : LedMotion, optional
         How the brick moves from each frame's instant to its LEDs', where that is known better than splines
         through 30 frames a second can tell: from camera and IMU together, see `led_motion`.
+    first : FirstPoses, optional
+        Of the same observations, from `start_poses`, which ``form`` is of; default found here.
 
     Returns
     -------
@@ -87,18 +86,12 @@ def solve_poses(
         NaN, with the reason in the flags, where four LEDs do not give one pose. Covariances are scaled by the
         run's, and the frame's own, reduced chi-square where that is above one.
     """
-    n, n_leds = observations.uv_px.shape[:2]
-    if n_leds != brick_model.n_leds or len(observations.sensor_timestamp_ns) != n:
-        raise TrackingError(
-            f"observations are of {n_leds} LEDs in {n} frames with {len(observations.sensor_timestamp_ns)} "
-            f"time stamps; the layout '{brick_model.name}' has {brick_model.n_leds} LEDs"
-        )
+    n, n_leds = _checked_shape(observations, brick_model)
     t_ns, led_t_ns = led_times_ns(observations, ray_model)
-    used = ((observations.led_flags & NOT_USED) == 0) & all_finite(observations.uv_px)
-    uv = np.where(used[..., None], observations.uv_px, np.nan)
-    start_R, start_t = prsoi_starts(uv, ray_model, brick_model, form)
     flags = np.asarray(observations.frame_flags, dtype=np.int64).copy()
     if not refined:
+        uv = _used_px(observations)
+        start_R, start_t = prsoi_starts(uv, ray_model, brick_model, form)
         return _finish(
             observations,
             t_ns,
@@ -108,7 +101,7 @@ def solve_poses(
             np.full((n, 6, 6), np.nan),
             np.full((n, n_leds, 2), np.nan),
             flags,
-            used,
+            all_finite(uv),
             brick_model,
         )
     collar_mm = collar_of(brick_model)
@@ -117,21 +110,22 @@ def solve_poses(
     def fit(uv: FloatArray, R: FloatArray, t: FloatArray, motion: LedMotion | None) -> RefinedPoses:
         return refine_poses(uv, cov, R, t, ray_model, brick_model, collar_mm=collar_mm, motion=motion)
 
-    poses = fit(uv, start_R, start_t, None)
-    poses, ambiguous = _other_starts(uv, cov, poses, t_ns, ray_model, brick_model, collar_mm)
-    flags[ambiguous] |= PoseFlag.AMBIGUOUS
+    first = first or start_poses(observations, ray_model, brick_model, form=form)
+    flags[first.is_ambiguous] |= PoseFlag.AMBIGUOUS
+    uv, R, t_mm = first.uv_px, first.R_camera_brick, first.t_camera_brick_mm
     known_motion = motion
     for _ in range(_PASSES):
         if rolling_shutter and known_motion is None:
-            motion = _motion_to_leds(t_ns, led_t_ns, poses)
-        before, n_before = poses.t_camera_brick_mm, int(all_finite(uv).sum())
-        poses = fit(uv, poses.R_camera_brick, before, motion)
+            motion = _motion_to_leds(t_ns, led_t_ns, R, t_mm)
+        n_before = int(all_finite(uv).sum())
+        poses = fit(uv, R, t_mm, motion)
         uv = _without_outliers(uv, poses)
-        moved_mm = np.abs(poses.t_camera_brick_mm - before)
+        moved_mm = np.abs(poses.t_camera_brick_mm - t_mm)
+        R, t_mm = poses.R_camera_brick, poses.t_camera_brick_mm
         if int(all_finite(uv).sum()) == n_before and not (moved_mm > _SETTLED_MM).any():
             break
     else:
-        poses = fit(uv, poses.R_camera_brick, poses.t_camera_brick_mm, motion)
+        poses = fit(uv, R, t_mm, motion)
     return _finish(
         observations,
         t_ns,
@@ -144,6 +138,31 @@ def solve_poses(
         all_finite(uv),
         brick_model,
     )
+
+
+def start_poses(
+    observations: LedObservations, ray_model: RayModel, brick_model: BrickModel, *, form: PrsoiForm = "safe"
+) -> FirstPoses:
+    """Return what `solve_poses` starts from; the same for any motion, so had once for several solutions."""
+    _checked_shape(observations, brick_model)
+    t_ns, _ = led_times_ns(observations, ray_model)
+    uv = _used_px(observations)
+    return first_poses(uv, observations.cov_px2, t_ns, ray_model, brick_model, form=form)
+
+
+def _used_px(observations: LedObservations) -> FloatArray:
+    used = ((observations.led_flags & NOT_USED) == 0) & all_finite(observations.uv_px)
+    return np.where(used[..., None], observations.uv_px, np.nan)
+
+
+def _checked_shape(observations: LedObservations, brick_model: BrickModel) -> tuple[int, int]:
+    n, n_leds = observations.uv_px.shape[:2]
+    if n_leds != brick_model.n_leds or len(observations.sensor_timestamp_ns) != n:
+        raise TrackingError(
+            f"observations are of {n_leds} LEDs in {n} frames with {len(observations.sensor_timestamp_ns)} "
+            f"time stamps; the layout '{brick_model.name}' has {brick_model.n_leds} LEDs"
+        )
+    return n, n_leds
 
 
 def led_motion(at_frames: FusedTrack, at_leds: FusedTrack) -> LedMotion:
@@ -168,118 +187,6 @@ def led_motion(at_frames: FusedTrack, at_leds: FusedTrack) -> LedMotion:
     )
 
 
-def _dof(uv: FloatArray) -> FloatArray:
-    return np.asarray(2.0 * all_finite(uv).sum(axis=1) - 6.0)
-
-
-def _other_starts(
-    uv: FloatArray,
-    cov: FloatArray,
-    poses: RefinedPoses,
-    t_ns: IntArray,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    collar_mm: float | None,
-) -> tuple[RefinedPoses, BoolArray]:
-    """Try poses from three LEDs where the first pose is missing, doubtful, or could have a twin.
-
-    Returns the better poses, and which frames have two that the pixels cannot tell apart; those have NaN.
-    """
-    n, n_leds = uv.shape[:2]
-    seen = all_finite(uv)
-    enough = seen.sum(axis=1) >= MIN_LEDS
-    bad = ~np.isfinite(poses.chi2) | (poses.chi2 > _DOUBT_CHI2_PER_DOF * np.maximum(_dof(uv), 1))
-    hidden = seen.sum(axis=1) < n_leds
-    frames = np.flatnonzero(enough & (bad | hidden))
-    ambiguous = np.zeros(n, dtype=bool)
-    if frames.size == 0:
-        return poses, ambiguous
-    triple = np.array([_widest_triple(brick_model.led_positions_mm, seen[i]) for i in frames])
-    centre = ray_centre_mm(ray_model)
-    points, _ = rays_of(ray_model, uv[frames[:, None], triple])
-    bearing = points - centre
-    bearing /= np.linalg.norm(bearing, axis=-1, keepdims=True)
-    R, t, valid = solve_p3p(bearing, brick_model.led_positions_mm[triple])
-    R = np.where(valid[..., None, None], R, np.nan)
-    t = np.where(valid[..., None], t + centre, np.nan)
-    k = R.shape[1]
-    tries = refine_poses(
-        np.repeat(uv[frames], k, axis=0),
-        np.repeat(cov[frames], k, axis=0),
-        R.reshape(-1, 3, 3),
-        t.reshape(-1, 3),
-        ray_model,
-        brick_model,
-        collar_mm=collar_mm,
-        max_steps=20,
-    )
-    visible = np.where(np.repeat(seen[frames], k, axis=0), tries.facing > 0, True).all(axis=1)
-    chi2 = np.where(np.isfinite(tries.chi2) & visible, tries.chi2, np.inf).reshape(-1, k)
-    R_try = tries.R_camera_brick.reshape(-1, k, 3, 3)
-    t_try = tries.t_camera_brick_mm.reshape(-1, k, 3)
-    R_out, t_out = poses.R_camera_brick.copy(), poses.t_camera_brick_mm.copy()
-    for row, i in enumerate(frames):
-        own = poses.chi2[i] if np.isfinite(poses.chi2[i]) else np.inf
-        all_chi2 = np.append(chi2[row], own)
-        all_R = np.concatenate([R_try[row], R_out[i][None]])
-        all_t = np.concatenate([t_try[row], t_out[i][None]])
-        best = int(np.argmin(all_chi2))
-        if not np.isfinite(all_chi2[best]):
-            continue
-        R_out[i], t_out[i] = all_R[best], all_t[best]
-        close = np.isfinite(all_chi2) & (all_chi2 < all_chi2[best] + _RIVAL_CHI2)
-        turn = np.linalg.norm(rvec_from_matrix(all_R[best].T @ all_R[close]), axis=1)
-        if (turn > _SAME_POSE_RAD).any():
-            ambiguous[i] = True
-    _believe_neighbours(ambiguous, R_out, t_out, R_try, t_try, chi2, frames, t_ns)
-    R_out[ambiguous] = np.nan
-    return (
-        refine_poses(uv, cov, R_out, t_out, ray_model, brick_model, collar_mm=collar_mm),
-        ambiguous,
-    )
-
-
-def _believe_neighbours(
-    ambiguous: BoolArray,
-    R: FloatArray,
-    t: FloatArray,
-    R_try: FloatArray,
-    t_try: FloatArray,
-    chi2: FloatArray,
-    frames: IntArray,
-    t_ns: IntArray,
-) -> None:
-    """Settle frames with two poses by the frame beside them, if near one and far from the other."""
-    period = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
-    row_of = {int(i): row for row, i in enumerate(frames)}
-    for order in (range(len(t_ns)), range(len(t_ns) - 1, -1, -1)):
-        before: int | None = None
-        for i in order:
-            if ambiguous[i] and before is not None and abs(int(t_ns[i] - t_ns[before])) < 1.5 * period:
-                row = row_of[i]
-                near = np.isfinite(chi2[row]) & (chi2[row] < np.nanmin(chi2[row]) + _RIVAL_CHI2)
-                index = np.flatnonzero(near)
-                turn = np.linalg.norm(rvec_from_matrix(R[before].T @ R_try[row, index]), axis=1)
-                rank = np.argsort(turn)
-                others = turn[rank][turn[rank] > turn[rank[0]] + _SAME_POSE_RAD]
-                if others.size == 0 or others[0] > 4 * turn[rank[0]] + 0.05:
-                    pick = index[rank[0]]
-                    R[i], t[i] = R_try[row, pick], t_try[row, pick]
-                    ambiguous[i] = False
-            if not ambiguous[i] and np.isfinite(R[i]).all():
-                before = i
-
-
-def _widest_triple(positions: FloatArray, seen: BoolArray) -> IntArray:
-    """Return the three seen LEDs that span the largest triangle."""
-    index = np.flatnonzero(seen)
-    p = positions[index]
-    i, j, k = np.array([(a, b, c) for a in range(len(p)) for b in range(a) for c in range(b)]).T
-    area = np.linalg.norm(np.cross(p[j] - p[i], p[k] - p[i]), axis=1)
-    best = int(np.argmax(area))
-    return np.asarray(index[[i[best], j[best], k[best]]], dtype=np.int64)
-
-
 def _without_outliers(uv: FloatArray, poses: RefinedPoses) -> FloatArray:
     """Leave out the worst LED of each frame whose residual is beyond belief, while five others remain."""
     n_seen = all_finite(uv).sum(axis=1)
@@ -292,12 +199,14 @@ def _without_outliers(uv: FloatArray, poses: RefinedPoses) -> FloatArray:
     return out
 
 
-def _motion_to_leds(t_ns: IntArray, led_t_ns: IntArray, poses: RefinedPoses) -> LedMotion:
+def _motion_to_leds(
+    t_ns: IntArray, led_t_ns: IntArray, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray
+) -> LedMotion:
     """Return how far the brick moves from each frame's instant to each LED's, by splines over frames."""
     n, n_leds = led_t_ns.shape
     rvec, shift = np.zeros((n, n_leds, 3)), np.zeros((n, n_leds, 3))
     twist_sd = np.tile(_UNKNOWN_TWIST, (n, 1))
-    valid = np.flatnonzero(all_finite(poses.R_camera_brick, 2))
+    valid = np.flatnonzero(all_finite(R_camera_brick, 2))
     if valid.size >= 2:
         seconds = (t_ns - t_ns[valid[0]]) * 1e-9
         led_seconds = (led_t_ns - t_ns[valid[0]]) * 1e-9
@@ -305,9 +214,9 @@ def _motion_to_leds(t_ns: IntArray, led_t_ns: IntArray, poses: RefinedPoses) -> 
         for part in np.split(valid, np.flatnonzero(np.diff(seconds[valid]) > _MAX_GAP_PERIODS * period) + 1):
             if part.size < 2:
                 continue
-            R0 = poses.R_camera_brick[part[part.size // 2]]
-            turns = rvec_from_matrix(R0.T @ poses.R_camera_brick[part])
-            samples = np.hstack([turns, poses.t_camera_brick_mm[part]])
+            R0 = R_camera_brick[part[part.size // 2]]
+            turns = rvec_from_matrix(R0.T @ R_camera_brick[part])
+            samples = np.hstack([turns, t_camera_brick_mm[part]])
             spline = CubicSpline(seconds[part], samples)
             here, there = spline(seconds[part]), spline(led_seconds[part])
             back = np.swapaxes(matrix_from_rvec(here[:, :3]), -1, -2)[:, None]
@@ -346,7 +255,7 @@ def _misfit(poses: RefinedPoses, uv: FloatArray) -> FloatArray:
     Never below one: what all LEDs have in common does not show in residuals, and the freedom that the profile
     and the twist leave the LEDs takes some of the chi-square.
     """
-    dof = _dof(uv)
+    dof = degrees_of_freedom(uv)
     with np.errstate(invalid="ignore", divide="ignore"):
         reduced = np.where(dof >= 2, poses.chi2 / dof, np.nan)
     good = np.isfinite(reduced)

@@ -21,6 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.rotations import nearest_rotation
 from bricktrack_host.tracking.finite import all_finite
@@ -95,6 +97,19 @@ def prsoi_poses(
         max_iterations=max_iterations,
         cross_sign=1.0,
     )
+
+
+def prsoi_starts(
+    uv_px: FloatArray, ray_model: RayModel, brick_model: BrickModel, form: PrsoiForm = "safe"
+) -> tuple[FloatArray, FloatArray]:
+    """Return the PRSOI poses, (n, 3, 3) and (n, 3), of centroids (n, n_leds, 2), NaN where unseen."""
+    a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
+    on_a, on_b = np.full_like(uv_px, np.nan), np.full_like(uv_px, np.nan)
+    seen = all_finite(uv_px)
+    on_a[seen] = ray_model.points_on_plane(uv_px[seen], a)
+    on_b[seen] = ray_model.points_on_plane(uv_px[seen], b)
+    found = prsoi_poses(on_a, on_b, brick_model.led_positions_mm, plane_a_mm=a, plane_b_mm=b, form=form)
+    return found.R_camera_brick, found.t_camera_brick_mm
 
 
 def _iterate(

@@ -5,7 +5,7 @@ from pinhole import PinholeCamera
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.tracking.correspondence import prsoi_starts
+from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import LedMotion, refine_poses
 
 CAMERA = PinholeCamera()
