@@ -78,9 +78,10 @@ def test_packets_and_metadata_meet_at_the_stamp(shake: Filmed) -> None:
     assert {m.exposure_us for m in sink.metadata} == {section.exposure_us} == {round(106 * 18.9035)}
 
 
-def test_keyframes_come_every_tenth_picture(shake: Filmed) -> None:
+def test_keyframes_come_at_least_every_tenth_picture(shake: Filmed) -> None:
     keys = [i for i, p in enumerate(shake[1].packets) if p.keyframe]
-    assert keys[0] == 0 and {b - a for a, b in pairwise(keys)} == {10}
+    # Sooner where x264 sees a change of scene: picamera2 leaves that on as well.
+    assert keys[0] == 0 and max(b - a for a, b in pairwise([*keys, len(shake[1].packets)])) <= 10
 
 
 def test_it_says_how_pictures_are_taken(shake: Filmed) -> None:
