@@ -1,6 +1,6 @@
 """Draw the README's picture from a processed sample: what the camera saw, what came out, how far from the truth.
 
-    python scripts/readme_picture.py RESULTS_FOLDER TRUTH OUTPUT.png
+python scripts/readme_picture.py RESULTS_FOLDER TRUTH OUTPUT.png
 """
 
 import sys
@@ -49,11 +49,15 @@ def main() -> None:
             color=colour,
             lw=1.0,
         )
-    hidden = frames[(result.observations.led_flags[:, 0] & int(LedFlag.MISSING | LedFlag.PARTLY_COVERED)) != 0]
+    hidden = frames[
+        (result.observations.led_flags[:, 0] & int(LedFlag.MISSING | LedFlag.PARTLY_COVERED)) != 0
+    ]
     if hidden.size:
         for axes in (motion, error):
             axes.axvspan(hidden[0], hidden[-1], color="0.9", lw=0)
-        motion.text(hidden.mean(), motion.get_ylim()[1], "m0 hidden", ha="center", va="top", fontsize=8, color="0.35")
+        motion.text(
+            hidden.mean(), motion.get_ylim()[1], "m0 hidden", ha="center", va="top", fontsize=8, color="0.35"
+        )
     motion.set_ylabel("from rest, mm")
     motion.set_title("fused at every edge of the square wave; dots: camera alone", fontsize=10)
     motion.legend(loc="lower left", ncols=3, frameon=False, fontsize=9)
