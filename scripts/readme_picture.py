@@ -6,7 +6,6 @@ python scripts/readme_picture.py RESULTS_FOLDER TRUTH OUTPUT.png
 import sys
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from bricktrack_host.quality import LedFlag
