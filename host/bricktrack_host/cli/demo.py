@@ -23,7 +23,6 @@ from bricktrack_common.wire_messages import StatusReply
 from bricktrack_host.cli import calibrate
 from bricktrack_host.cli._console import err, out
 from bricktrack_host.cli.process import say_processed, stage_bar
-from bricktrack_host.pipeline import process_run
 from bricktrack_host.transfer.fleet_config import load_fleet
 from bricktrack_host.transfer.unit_client import UnitClient
 
@@ -92,6 +91,8 @@ def demo(
 
         bricktrack demo --folder /tmp/demo --seed 7 --open
     """
+    from bricktrack_host.pipeline import process_run
+
     _prepare(folder)
     port = _free_port()
     config = folder / "bricktrackd.toml"

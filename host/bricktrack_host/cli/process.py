@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -14,22 +14,14 @@ from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.cli._console import err, out, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
 from bricktrack_host.cli._units import DEFAULT_FLEET, FleetOption
-from bricktrack_host.pipeline import (
-    REPORT_NAME,
-    RESULTS_FOLDER,
-    ProcessedRun,
-    ProcessSettings,
-    find_truth,
-    process_run,
-)
-from bricktrack_host.reporting.report import ReportExtras, write_report
-from bricktrack_host.reporting.report_pictures import PICTURES_NAME, load_pictures
-from bricktrack_host.results.result_store import read_result
-from bricktrack_host.results.run_summary import key_figures, verdict
-from bricktrack_host.results.true_motion import read_true_motion
-from bricktrack_host.results.truth import TruthComparison, compare_with_truth, comparison_table
 from bricktrack_host.transfer.fleet_config import UnitConfig, load_fleet
 from bricktrack_host.transfer.pull import PulledRun
+
+# What computes is imported by the command that runs it: OpenCV, SciPy, PyArrow and matplotlib take seconds
+# to load, and `--help`, `status` and `pull` need none of them.
+if TYPE_CHECKING:
+    from bricktrack_host.pipeline import ProcessedRun
+    from bricktrack_host.results.truth import TruthComparison
 
 CalibrationOption = Annotated[
     Path | None,
@@ -108,6 +100,8 @@ def process(
 
         bricktrack process runs/b2_* --fleet fleet.toml
     """
+    from bricktrack_host.pipeline import ProcessSettings, process_run
+
     if output is not None and len(runs) > 1:
         raise ConfigError(
             f"--output is for one run; {len(runs)} were given. Leave it out: each has its own folder"
@@ -142,6 +136,8 @@ def process(
 
 def process_pulled(unit: UnitConfig, pulled: PulledRun) -> None:
     """Process one run that was just pulled, with the calibration and layout that the fleet file names."""
+    from bricktrack_host.pipeline import process_run
+
     if unit.calibration_path is None or unit.layout_path is None:
         raise ConfigError(
             f"fleet.toml names no calibration or no layout for unit '{unit.name}'. Add them, or "
@@ -176,6 +172,14 @@ def report(
 
         bricktrack report runs/sample_motion --truth tests/data/path-traced/truth
     """
+    from bricktrack_host.pipeline import REPORT_NAME, RESULTS_FOLDER, find_truth
+    from bricktrack_host.reporting.report import ReportExtras, write_report
+    from bricktrack_host.reporting.report_pictures import PICTURES_NAME, load_pictures
+    from bricktrack_host.results.result_store import read_result
+    from bricktrack_host.results.run_summary import key_figures, verdict
+    from bricktrack_host.results.true_motion import read_true_motion
+    from bricktrack_host.results.truth import compare_with_truth
+
     folder = run / RESULTS_FOLDER if (run / MANIFEST_NAME).is_file() else run
     result = read_result(folder)
     path = find_truth(run, truth)
@@ -209,8 +213,10 @@ def _files_for(
     return found[0], found[1]
 
 
-def say_processed(processed: ProcessedRun) -> None:
+def say_processed(processed: "ProcessedRun") -> None:
     """Print the verdict, the errors against truth where there is one, the time budget and where it all is."""
+    from bricktrack_host.results.run_summary import key_figures, verdict
+
     result = processed.result
     line, problems = verdict(result, key_figures(result))
     out.print(f"{result.manifest.run_id}: {line}", markup=False, soft_wrap=True)
@@ -231,8 +237,10 @@ def say_processed(processed: ProcessedRun) -> None:
     out.print(f"report:  {processed.report}", markup=False, soft_wrap=True)
 
 
-def say_truth(comparison: TruthComparison | None) -> None:
+def say_truth(comparison: "TruthComparison | None") -> None:
     """Print the errors against simulated truth, absolute and as displacements from rest."""
+    from bricktrack_host.results.truth import comparison_table
+
     if comparison is None:
         return
     out.print(comparison_table(comparison))
