@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntFlag
 from pathlib import Path
-from typing import Annotated, BinaryIO
+from typing import Annotated, BinaryIO, Literal
 
 import msgspec
 import numpy as np
@@ -26,7 +26,7 @@ _MAX_GYRO_STEP_RADPS = 40.0
 
 IMU_SCHEMA = StreamSchema(
     "bricktrack.imu",
-    1,
+    2,
     (
         Field("slot", "int", "number of the 10 ms grid point since the grid's start"),
         Field("t_before_ns", "int", "ns, CLOCK_MONOTONIC, before the bus transaction"),
@@ -70,6 +70,9 @@ UNUSABLE = (
 
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
 
+AxisMap = Literal["P0", "P1", "P2", "P3", "P4", "P5", "P6", "P7"]
+"""How the chip lies on its board, by the names of the data sheet's section 3.4; P1 turns nothing."""
+
 
 class ImuDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a stream's header and the manifest say of one sensor.
@@ -92,6 +95,10 @@ class ImuDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         The grid: slot n is due at ``t0_ns + n * period_ns``, CLOCK_MONOTONIC.
     latency_ns : int, ns
         Added to the middle of the transaction to give the sample time; negative for a filter's lag.
+    axis_map : str
+        The axis remap that the chip applied; the data are in the axes after it.
+    calibration_restored : bool
+        Whether a saved calibration was written into the chip; only fusion modes use one.
     """
 
     name: Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]{1,16}$")]
@@ -107,6 +114,8 @@ class ImuDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     period_ns: Annotated[int, msgspec.Meta(gt=0)]
     t0_ns: int
     latency_ns: int = 0
+    axis_map: AxisMap = "P1"
+    calibration_restored: bool = False
 
 
 @dataclass(frozen=True, slots=True)

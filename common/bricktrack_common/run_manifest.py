@@ -18,7 +18,7 @@ from bricktrack_common.typed_data import convert, dump_json
 
 MANIFEST_NAME = "manifest.json"
 MANIFEST_SCHEMA = "bricktrack.run"
-MANIFEST_VERSION = 1
+MANIFEST_VERSION = 2
 VIDEO_NAME = "video.h264"
 FRAMES_NAME = "frames.msgpack"
 EDGES_NAME = "edges.msgpack"
@@ -56,16 +56,35 @@ class CameraSection(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     encoder_settings: dict[str, str | int | float | bool | None]
 
 
+class WaveSection(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the unit saw of the square wave, counted against its period; the host judges the edges anew.
+
+    ``hz`` is by the unit's clock, `None` where too few edges came to tell. ``last_edge_ns`` belongs to the
+    last edge in step; ``n_after_last`` periods would still have fitted into the window behind it.
+    ``rejected_ns`` are rising edges between arming and t = 0 that did not count (the newest hundred).
+    """
+
+    hz: float | None = None
+    n_missed: _Count = 0
+    n_extra: _Count = 0
+    n_late: _Count = 0
+    last_edge_ns: int | None = None
+    n_after_last: _Count = 0
+    rejected_ns: list[int] = []
+
+
 class TriggerSection(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The square wave.
 
-    ``t0_ns`` is the kernel stamp of the first rising edge after arming, `None` if there was none.
-    ``nominal_hz`` is the wave's frequency as configured, `None` if not told.
+    ``t0_ns`` is the kernel stamp of the first rising edge after arming that counts, `None` if there was
+    none. ``nominal_hz`` is the wave's frequency as configured, `None` if not told. ``wave`` is `None` in
+    runs of before version 2 and in imported ones.
     """
 
     pin: str
     t0_ns: int | None
     nominal_hz: float | None = None
+    wave: WaveSection | None = None
 
 
 class ClocksSection(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -77,7 +96,11 @@ class ClocksSection(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class QualitySection(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Counts that tell at a glance whether the run is good."""
+    """Counts that tell at a glance whether the run is good.
+
+    ``imu_unusable`` are samples that came but are not to be believed (stuck, blank, torn, sensor reset);
+    ``imu_unique_hz`` says, by sensor, how many *new* samples came a second.
+    """
 
     frames: _Count = 0
     frames_dropped: _Count = 0
@@ -86,6 +109,8 @@ class QualitySection(_Section, frozen=True, kw_only=True, forbid_unknown_fields=
     imu_gaps: _Count = 0
     imu_repeats: _Count = 0
     imu_clipped: _Count = 0
+    imu_unusable: _Count = 0
+    imu_unique_hz: dict[str, float] = {}
     imu_late_max_us: float = 0.0
     edges: _Count = 0
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import adafruit_bno055
 
 from bricktrack_common.errors import HardwareError
+from bricktrack_common.imu_records import AxisMap
 from bricktrack_device.config import ImuMode
 from bricktrack_device.interfaces import I2cBus
 
@@ -26,6 +27,20 @@ REG_CALIB_STAT = 0x35
 REG_ST_RESULT = 0x36
 REG_SYS_STATUS = 0x39
 REG_UNIT_SEL = 0x3B
+REG_OPR_MODE = 0x3D
+REG_AXIS_MAP = 0x41
+"""AXIS_MAP_CONFIG, and AXIS_MAP_SIGN behind it."""
+REG_CALIBRATION = 0x55
+N_CALIBRATION_BYTES = 22
+"""Offsets and radii, 0x55..0x6A; the chip takes them when the last byte is written."""
+CALIBRATED = 0xFF
+CALIBRATED_WITHOUT_MAGNETOMETER = 0x3C
+"""Gyroscope and accelerometer alone: all that IMUPLUS calibrates."""
+AXIS_MAPS: dict[AxisMap, tuple[int, int]] = {
+    "P0": (0x21, 0x04), "P1": (0x24, 0x00), "P2": (0x24, 0x06), "P3": (0x21, 0x02),
+    "P4": (0x24, 0x03), "P5": (0x21, 0x01), "P6": (0x21, 0x07), "P7": (0x24, 0x05),
+}  # fmt: skip
+"""AXIS_MAP_CONFIG and AXIS_MAP_SIGN of the placements (data sheet, table 3-4 and figure 4)."""
 N_STATUS_BYTES = 5
 """One burst from SYS_STATUS to OPR_MODE (0x39..0x3D)."""
 REG1_ACC_CONFIG = 0x08
@@ -41,6 +56,8 @@ _ACC_RANGES_G = (2.0, 4.0, 8.0, 16.0)
 _GYRO_RANGES_DPS = (2000.0, 1000.0, 500.0, 250.0, 125.0)
 _SELF_TEST_PASSED = 0x0F
 _ATTEMPTS = 3
+_TO_CONFIG_S = 0.02
+"""The data sheet's 19 ms; any other change takes 7 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +70,10 @@ class SensorFacts:
         The unique id as hex, or ``""`` where it could not be read.
     acc_range_g, gyro_range_dps : float
         From the configuration registers, not from what was asked for.
+    axis_map : str
+        As read back.
+    calibration_restored : bool
+        Whether a saved calibration was written and read back.
     warnings : list of str
     """
 
@@ -62,16 +83,25 @@ class SensorFacts:
     acc_range_g: float
     gyro_range_dps: float
     calibration: int
+    axis_map: AxisMap
+    calibration_restored: bool
     warnings: list[str]
 
 
 def set_up(
-    bus: I2cBus, address: int, mode: ImuMode, *, sleep: Callable[[float], None] = time.sleep
+    bus: I2cBus,
+    address: int,
+    mode: ImuMode,
+    *,
+    axis_map: AxisMap = "P1",
+    saved_calibration: Callable[[str], bytes | None] = lambda chip_id: None,
+    sleep: Callable[[float], None] = time.sleep,
 ) -> SensorFacts:
-    """Reset a sensor, set mode, ranges and units, read everything back.
+    """Reset a sensor, set mode, ranges, axes and units, read everything back.
 
     In the raw modes the accelerometer is set to ±16 g, bandwidth 62.5 Hz, and the gyroscope to 2000 dps,
-    32 Hz. Fusion modes own these settings (±4 g): there they are only read.
+    32 Hz. Fusion modes own these settings (±4 g): there they are only read. ``saved_calibration`` is asked
+    with the chip's id in a fusion mode (raw data are not compensated), and what it returns is written.
 
     Raises
     ------
@@ -92,8 +122,12 @@ def set_up(
             _make_sure(bus, address, REG1_GYR_CONFIG_0, _GYR_CONFIG_2000DPS_32HZ, page=1, what="GYR_CONFIG_0")
         if _read(bus, address, REG_UNIT_SEL) & _UNITS_THAT_SCALE:
             _make_sure(bus, address, REG_UNIT_SEL, _UNIT_SEL_DEFAULT, page=0, what="UNIT_SEL")
+        _set_axis_map(bus, address, axis_map)
         warnings = _self_test_words(_read(bus, address, REG_ST_RESULT))
         chip_id = _unique_id(bus, address)
+        calibration_registers = saved_calibration(chip_id) if fusion else None
+        if calibration_registers is not None:
+            _write_calibration(bus, address, calibration_registers)
         driver.mode = opr_mode
         sleep(0.02)
         mode_now = int(driver.mode)
@@ -126,8 +160,46 @@ def set_up(
         acc_range_g=_ACC_RANGES_G[acc_config & 0x03],
         gyro_range_dps=_GYRO_RANGES_DPS[gyro_code],
         calibration=calibration,
+        axis_map=axis_map,
+        calibration_restored=calibration_registers is not None,
         warnings=warnings,
     )
+
+
+def is_calibrated(opr_mode: int, calib_stat: int) -> bool:
+    """Tell whether CALIB_STAT says that everything is calibrated that a fusion mode uses."""
+    if opr_mode not in FUSION_MODES:
+        return False  # the raw modes calibrate nothing
+    needed = CALIBRATED if opr_mode == OPR_MODES["ndof"] else CALIBRATED_WITHOUT_MAGNETOMETER
+    return calib_stat & needed == needed
+
+
+def read_calibration(
+    bus: I2cBus, address: int, opr_mode: int, *, sleep: Callable[[float], None] = time.sleep
+) -> tuple[bytes, int] | None:
+    """Return a calibrated sensor's 22 bytes and its CALIB_STAT, `None` if it is not calibrated.
+
+    Never during a run: the sensor goes to CONFIG mode for it, and back to ``opr_mode``.
+
+    Raises
+    ------
+    HardwareError
+        If the bus fails.
+    """
+    try:
+        calib_stat = _read(bus, address, REG_CALIB_STAT)
+        if not is_calibrated(opr_mode, calib_stat):
+            return None
+        _write(bus, address, REG_OPR_MODE, 0)
+        sleep(_TO_CONFIG_S)
+        try:
+            registers = bus.read_burst(address, REG_CALIBRATION, N_CALIBRATION_BYTES)
+        finally:
+            _write(bus, address, REG_OPR_MODE, opr_mode)
+            sleep(_TO_CONFIG_S)
+    except OSError as e:
+        raise HardwareError(_bus_words(address, "when its calibration was read", e)) from e
+    return registers, calib_stat
 
 
 def read_chip_id(bus: I2cBus, address: int) -> int:
@@ -178,11 +250,36 @@ def _self_test_words(result: int) -> list[str]:
     return [f"power-on self-test not passed: {', '.join(failed)} (ST_RESULT 0x{result:02X})"]
 
 
-def _write(bus: I2cBus, address: int, register: int, value: int) -> None:
+def _set_axis_map(bus: I2cBus, address: int, axis_map: AxisMap) -> None:
+    """Write both registers at once, in CONFIG mode; the chip keeps the old map if it dislikes the new one."""
+    wanted = bytes(AXIS_MAPS[axis_map])
+    if bus.read_burst(address, REG_AXIS_MAP, 2) != wanted:
+        _write(bus, address, REG_AXIS_MAP, *wanted)
+    now = bus.read_burst(address, REG_AXIS_MAP, 2)
+    if now != wanted:
+        raise HardwareError(
+            f"IMU at I2C address 0x{address:02X}: axis map reads {now.hex()} after {wanted.hex()} ({axis_map}) "
+            "was written. Check its supply, then run 'bricktrackd check'"
+        )
+
+
+def _write_calibration(bus: I2cBus, address: int, registers: bytes) -> None:
+    if len(registers) != N_CALIBRATION_BYTES:
+        raise HardwareError(f"a calibration has {N_CALIBRATION_BYTES} bytes; got {len(registers)}")
+    _write(bus, address, REG_CALIBRATION, *registers)
+    now = bus.read_burst(address, REG_CALIBRATION, N_CALIBRATION_BYTES)
+    if now != registers:
+        raise HardwareError(
+            f"IMU at I2C address 0x{address:02X}: calibration reads {now.hex()} after {registers.hex()} was "
+            "written. Delete its file in the storage folder's calibration/ to start without"
+        )
+
+
+def _write(bus: I2cBus, address: int, register: int, *values: int) -> None:
     while not bus.try_lock():
         time.sleep(0.001)
     try:
-        bus.writeto(address, bytes([register, value]))
+        bus.writeto(address, bytes([register, *values]))
     finally:
         bus.unlock()
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from bricktrack_common.errors import ConfigError
+from bricktrack_common.imu_records import AxisMap
 from bricktrack_common.typed_data import load_toml
 from bricktrack_common.wire_messages import DEFAULT_PORT
 from bricktrack_device.sim.settings import SimSettings
@@ -68,16 +69,29 @@ class CameraTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True)
     qp: Annotated[int, msgspec.Meta(ge=1, le=51)] | None = None
 
 
+class LedsTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[leds]``: how many LEDs the camera looks at, and the pins that switch them, if they hang on any.
+
+    ``active_high = false`` where a pin sinks the current. A simulated unit has LEDs on any pin.
+    """
+
+    count: Annotated[int, msgspec.Meta(ge=1, le=64)] = 7
+    pins: list[Annotated[str, msgspec.Meta(pattern=r"^(GPIO|BCM|BOARD)?[0-9]{1,2}$")]] = []
+    active_high: bool = True
+
+
 class TriggerTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``[trigger]``: the pin of the square wave, and which edge counts as the first.
 
-    ``quiet_gap_ms`` is how long the line must have been quiet before the first edge, 0 for no such gap;
-    ``require_low`` asks that the line was seen low after arming.
+    With ``nominal_hz`` an edge is believed as the first only when those after it come at that period, so that
+    a lone glitch starts no run; without it the first edge after arming is. ``quiet_gap_ms`` is how long the
+    line must have been quiet before the first edge, 0 for no such gap; ``require_low`` asks that the line
+    was seen low after arming.
     """
 
     pin: Annotated[str, msgspec.Meta(pattern=r"^(GPIO|BCM|BOARD)?[0-9]{1,2}$")] = "GPIO17"
     pull: Pull = "down"
-    nominal_hz: Annotated[float, msgspec.Meta(gt=0, le=10_000)] | None = None
+    nominal_hz: Annotated[float, msgspec.Meta(ge=1, le=10_000)] | None = None
     quiet_gap_ms: Annotated[float, msgspec.Meta(ge=0, le=600_000)] = 0.0
     require_low: bool = True
 
@@ -101,7 +115,10 @@ class ImuTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     ``mode`` is "amg" (raw, ±16 g, the choice for shakes with impacts), "accgyro" (raw without
     magnetometer), "imuplus" or "ndof" (the chip's own orientation; ±4 g). ``latency_us`` is added to the
-    middle of the bus transaction to give the sample time: negative for a filter's lag. With
+    middle of the bus transaction to give the sample time: negative for a filter's lag. ``axis_map`` is the
+    placement whose remap the chip applies (data sheet, section 3.4; "P1" turns nothing). In the fusion modes a
+    calibration saved for this chip is written into it at every start, and with ``save_calibration = true``
+    it is saved after a run, or at disarming, whenever the chip says that it is fully calibrated. With
     ``required = true`` a unit whose sensor does not start refuses to arm.
     """
 
@@ -112,6 +129,8 @@ class ImuTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
     period_ms: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 10
     latency_us: Annotated[int, msgspec.Meta(ge=-100_000, le=100_000)] = 0
     status_every: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 10
+    axis_map: AxisMap = "P1"
+    save_calibration: bool = False
     required: bool = False
 
 
@@ -135,6 +154,7 @@ class DeviceConfig(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True
     storage: StorageTable = StorageTable()
     server: ServerTable = ServerTable()
     camera: CameraTable = CameraTable()
+    leds: LedsTable = LedsTable()
     trigger: TriggerTable = TriggerTable()
     recording: RecordingTable = RecordingTable()
     imu: list[ImuTable] = msgspec.field(default_factory=lambda: [ImuTable(name="brick")])
@@ -145,6 +165,11 @@ class DeviceConfig(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True
     def storage_folder(self) -> Path:
         """The storage folder, absolute."""
         return Path(self.storage.folder).expanduser().absolute()
+
+    @property
+    def calibration_folder(self) -> Path:
+        """Where the calibrations of inertial sensors are kept, absolute."""
+        return self.storage_folder / "calibration"
 
     def span_s(self, duration_s: float | None = None) -> float:
         """Return how long a run is from the start of its pre-roll to the end of its post-roll, s."""

@@ -6,17 +6,27 @@ camera nor the other sensors.
 
 import logging
 import multiprocessing
+import os
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from pathlib import Path
 
 from bricktrack_common.clocks import monotonic_ns
+from bricktrack_common.errors import StorageError
 from bricktrack_common.imu_records import FIRST_REGISTER, ImuDescription, ImuRecord
 from bricktrack_common.wire_messages import ImuStatus
 from bricktrack_device.bno055 import REG_CALIB_STAT
 from bricktrack_device.config import ImuTable, SamplerTable
-from bricktrack_device.imu_sampler import SamplerFailed, SamplerJob, SamplerReady, sampler_main
+from bricktrack_device.imu_calibration import save_calibration
+from bricktrack_device.imu_sampler import (
+    SamplerCalibrated,
+    SamplerFailed,
+    SamplerJob,
+    SamplerReady,
+    sampler_main,
+)
 from bricktrack_device.interfaces import BusOpener
 from bricktrack_device.sample_buffer import SampleBuffer
 
@@ -43,6 +53,8 @@ class ImuReader:
     realtime : SamplerTable
     span_s : float
         How far back records are kept.
+    calibration_folder : Path or None
+        Where calibrations are kept by chip; `None` keeps and restores none.
     main : callable
         What the process runs; replaced in tests of dying and hanging samplers.
     """
@@ -54,6 +66,7 @@ class ImuReader:
         realtime: SamplerTable,
         *,
         span_s: float,
+        calibration_folder: Path | None = None,
         main: SamplerMain = sampler_main,
     ) -> None:
         self.settings = settings
@@ -66,12 +79,17 @@ class ImuReader:
             opener=opener,
             address=settings.address,
             mode=settings.mode,
+            axis_map=settings.axis_map,
             period_ns=self._period_ns,
             status_every=settings.status_every,
             realtime=realtime,
             buffer_name=self._buffer.name,
             buffer_capacity=self._buffer.capacity,
+            parent_pid=os.getpid(),
+            calibration_folder=calibration_folder,
+            report_calibration=settings.save_calibration and calibration_folder is not None,
         )
+        self._calibration_folder = calibration_folder
         self._process: SpawnProcess = _context.Process(
             target=main, args=(job, self._child_connection), name=f"imu-{settings.name}", daemon=True
         )
@@ -162,6 +180,8 @@ class ImuReader:
             period_ns=self._period_ns,
             t0_ns=self._ready.t0_ns,
             latency_ns=self.settings.latency_us * 1000,
+            axis_map=facts.axis_map,
+            calibration_restored=facts.calibration_restored,
         )
 
     def slots_due(self, start_ns: int, end_ns: int) -> range:
@@ -209,6 +229,7 @@ class ImuReader:
         if self._buffer is None:
             return
         self._end_process()
+        self._take_messages()  # what the sensor had learnt comes last
         with self._lock:
             self._buffer.close()
             self._buffer = None
@@ -235,8 +256,26 @@ class ImuReader:
                     self._seen_at_ns = monotonic_ns()
                 elif isinstance(message, SamplerFailed):
                     self._problem = message.words
+                elif isinstance(message, SamplerCalibrated):
+                    self._keep(message)
         except (EOFError, OSError):
             return  # the process is gone; poll says so
+
+    def _keep(self, learnt: SamplerCalibrated) -> None:
+        if self._ready is None or self._calibration_folder is None:
+            return
+        try:
+            path = save_calibration(
+                self._calibration_folder,
+                self._ready.facts.chip_id,
+                self.settings.mode,
+                learnt.registers,
+                calib_stat=learnt.calib_stat,
+            )
+        except StorageError as e:
+            logger.warning("imu %s: %s", self.name, e)
+        else:
+            logger.info("imu %s: calibration of mode %s saved in %s", self.name, self.settings.mode, path)
 
     def _end_process(self) -> None:
         if self._process.pid is None or self._buffer is None:

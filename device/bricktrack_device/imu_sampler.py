@@ -11,13 +11,16 @@ import os
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import BricktrackError, HardwareError
-from bricktrack_common.imu_records import FIRST_REGISTER, N_DATA_BYTES, ImuRecord
-from bricktrack_device.bno055 import N_STATUS_BYTES, REG_SYS_STATUS, SensorFacts, set_up
+from bricktrack_common.imu_records import FIRST_REGISTER, N_DATA_BYTES, AxisMap, ImuRecord
+from bricktrack_device.bno055 import N_STATUS_BYTES, REG_SYS_STATUS, SensorFacts, read_calibration, set_up
 from bricktrack_device.config import ImuMode, SamplerTable
+from bricktrack_device.imu_calibration import load_calibration
 from bricktrack_device.interfaces import BusOpener, I2cBus
 from bricktrack_device.sample_buffer import SampleBuffer
 
@@ -35,11 +38,15 @@ class SamplerJob:
     opener: BusOpener
     address: int
     mode: ImuMode
+    axis_map: AxisMap
     period_ns: int
     status_every: int
     realtime: SamplerTable
     buffer_name: str
     buffer_capacity: int
+    parent_pid: int
+    calibration_folder: Path | None
+    report_calibration: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +67,14 @@ class SamplerReady:
 
 
 @dataclass(frozen=True, slots=True)
+class SamplerCalibrated:
+    """What a sensor had learnt when its sampling ended: 22 bytes, and its CALIB_STAT."""
+
+    registers: bytes
+    calib_stat: int
+
+
+@dataclass(frozen=True, slots=True)
 class SamplerFailed:
     """Why a sampler's process ends."""
 
@@ -70,36 +85,63 @@ def sampler_main(job: SamplerJob, connection: Connection) -> None:
     """Run one sampler until it is told to stop or its parent is gone; the entry point of its process."""
     # Ctrl-C reaches the whole process group; the daemon decides when sampling ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = os.getppid()
+    if os.getppid() != job.parent_pid:
+        return  # killed while this process began; nobody waits for samples, and its memory may be gone
     buffer = SampleBuffer(job.buffer_capacity, job.buffer_name)
     try:
-        bus = job.opener()
-        try:
-            facts = set_up(bus, job.address, job.mode)
-            scheduling = ask_for_realtime(job.realtime)
-            gc.collect()
-            gc.freeze()
-            gc.disable()
-            t0_ns = -(-(monotonic_ns() + _START_DELAY_NS) // job.period_ns) * job.period_ns
-            connection.send(SamplerReady(facts, t0_ns, scheduling))
-            sample(
-                bus,
-                job.address,
-                t0_ns=t0_ns,
-                period_ns=job.period_ns,
-                status_every=job.status_every,
-                append=buffer.append,
-                is_over=lambda: buffer.stop_asked or os.getppid() != parent,
-            )
-        finally:
-            bus.close()
+        _run(job, connection, buffer)
     except (BricktrackError, OSError) as e:
-        connection.send(SamplerFailed(str(e)))
+        _tell(connection, SamplerFailed(str(e)))
     except Exception as e:
-        connection.send(SamplerFailed(f"a bug in the sampler: {type(e).__name__}: {e}"))
+        _tell(connection, SamplerFailed(f"a bug in the sampler: {type(e).__name__}: {e}"))
         raise
     finally:
         buffer.close()
+
+
+def _run(job: SamplerJob, connection: Connection, buffer: SampleBuffer) -> None:
+    bus = job.opener()
+    try:
+        facts = set_up(
+            bus,
+            job.address,
+            job.mode,
+            axis_map=job.axis_map,
+            saved_calibration=partial(_saved_calibration, job),
+        )
+        scheduling = ask_for_realtime(job.realtime)
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        t0_ns = -(-(monotonic_ns() + _START_DELAY_NS) // job.period_ns) * job.period_ns
+        _tell(connection, SamplerReady(facts, t0_ns, scheduling))
+        sample(
+            bus,
+            job.address,
+            t0_ns=t0_ns,
+            period_ns=job.period_ns,
+            status_every=job.status_every,
+            append=buffer.append,
+            is_over=lambda: buffer.stop_asked or os.getppid() != job.parent_pid,
+        )
+        if job.report_calibration and buffer.stop_asked:
+            learnt = read_calibration(bus, job.address, facts.opr_mode)
+            if learnt is not None:
+                _tell(connection, SamplerCalibrated(*learnt))
+    finally:
+        bus.close()
+
+
+def _saved_calibration(job: SamplerJob, chip_id: str) -> bytes | None:
+    folder = job.calibration_folder
+    return None if folder is None else load_calibration(folder, chip_id, job.mode)
+
+
+def _tell(connection: Connection, message: SamplerReady | SamplerCalibrated | SamplerFailed) -> None:
+    try:
+        connection.send(message)
+    except BrokenPipeError:
+        return  # the daemon is gone; this process ends too
 
 
 def sample(

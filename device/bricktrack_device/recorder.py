@@ -149,7 +149,7 @@ class Recorder:
         trigger = session.trigger if session else None
         return RecorderStatus(
             state=self.state,
-            reason=self._machine.reason or self._doing,
+            reason=self._machine.reason or self._doing or (trigger.waiting_words() if trigger else ""),
             run_id=session.run_id if session else "",
             frames=session.ring.n_packets if session else 0,
             frame_age_ms=None if newest_us is None else (monotonic_ns() - newest_us * 1000) / 1e6,

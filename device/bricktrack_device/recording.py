@@ -11,9 +11,17 @@ from typing import BinaryIO, Literal
 import msgspec
 import numpy as np
 
+from bricktrack_common.arrays import IntArray
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.frame_times import write_frames
-from bricktrack_common.imu_records import ImuDescription, ImuFlag, ImuRecord, decode_imu, write_imu
+from bricktrack_common.imu_records import (
+    UNUSABLE,
+    ImuDescription,
+    ImuFlag,
+    ImuRecord,
+    decode_imu,
+    write_imu,
+)
 from bricktrack_common.run_folder import write_edges
 from bricktrack_common.run_manifest import (
     EDGES_NAME,
@@ -25,6 +33,7 @@ from bricktrack_common.run_manifest import (
     QualitySection,
     RunManifest,
     TriggerSection,
+    WaveSection,
 )
 from bricktrack_device.ring import VideoCut
 from bricktrack_device.run_store import RunWriter
@@ -51,13 +60,37 @@ class RunLog:
             file.write(msgspec.json.encode(event) + b"\n")
 
 
-@dataclass(frozen=True, slots=True)
+_USELESS = {
+    ImuFlag.STUCK: "repeat the one before for ten slots or more: the sensor no longer measured",
+    ImuFlag.BLANK: "are all zero or all ones: the sensor was in reset or off the bus",
+    ImuFlag.MODE_CHANGED: "came in another mode than the one set: the sensor had reset itself",
+    ImuFlag.BAD_QUATERNION: "have a quaternion that is none: torn or corrupted reads",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ImuRecording:
-    """One sensor's part of a run; ``n_slots`` is how many slots were due in the window."""
+    """One sensor's part of a run.
+
+    ``n_slots`` is how many slots were due in the window; ``flags`` are those of `decode_imu`.
+    """
 
     description: ImuDescription
     records: list[ImuRecord]
     n_slots: int
+    flags: IntArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "flags", decode_imu(self.description, self.records).flags)
+
+    def problems(self) -> list[str]:
+        """Return in words what makes samples useless, beyond the gaps that are counted anyway."""
+        name, words = self.description.name, []
+        for flag, what in _USELESS.items():
+            n = int(np.count_nonzero(self.flags & flag))
+            if n:
+                words.append(f"imu {name}: {n} of {self.n_slots} samples {what}")
+        return words
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +109,7 @@ class Recording:
     trigger_pin: str
     nominal_hz: float | None
     edges: EdgeTrain
+    wave: WaveSection
     clocks: ClocksSection
     window_ns: tuple[int, int]
     missing: list[str]
@@ -145,7 +179,10 @@ def build_manifest(recording: Recording) -> RunManifest:
         camera=recording.camera,
         imus=[imu.description for imu in recording.imus],
         trigger=TriggerSection(
-            pin=recording.trigger_pin, t0_ns=recording.edges.t0_ns, nominal_hz=recording.nominal_hz
+            pin=recording.trigger_pin,
+            t0_ns=recording.edges.t0_ns,
+            nominal_hz=recording.nominal_hz,
+            wave=recording.wave,
         ),
         clocks=recording.clocks,
         window_ns=recording.window_ns,
@@ -157,15 +194,22 @@ def build_manifest(recording: Recording) -> RunManifest:
 
 def quality(recording: Recording) -> QualitySection:
     """Return the counts that tell whether a recording is good; over all its inertial sensors together."""
-    slots = gaps = repeats = clipped = 0
+    slots = gaps = repeats = clipped = unusable = 0
+    unique_hz: dict[str, float] = {}
     late_max_ns = 0
     for imu in recording.imus:
-        flags = decode_imu(imu.description, imu.records).flags
+        flags = imu.flags
+        present = flags & ImuFlag.GAP == 0
+        fresh = present & (flags & (UNUSABLE | ImuFlag.REPEAT) == 0)
         slots += imu.n_slots
-        gaps += imu.n_slots - sum(r.data is not None for r in imu.records)
+        gaps += imu.n_slots - int(np.count_nonzero(present))
         repeats += int(np.count_nonzero(flags & ImuFlag.REPEAT))
         clipped += int(np.count_nonzero(flags & (ImuFlag.ACC_CLIPPED | ImuFlag.GYRO_CLIPPED)))
+        unusable += int(np.count_nonzero(present & (flags & UNUSABLE != 0)))
         t0_ns, period_ns = imu.description.t0_ns, imu.description.period_ns
+        if imu.n_slots:
+            hz = np.count_nonzero(fresh) * 1e9 / (imu.n_slots * period_ns)
+            unique_hz[imu.description.name] = round(float(hz), 3)
         lateness_ns = (r.t_before_ns - (t0_ns + r.slot * period_ns) for r in imu.records)
         late_max_ns = max(late_max_ns, max(lateness_ns, default=0))
     video = recording.video
@@ -177,6 +221,8 @@ def quality(recording: Recording) -> QualitySection:
         imu_gaps=gaps,
         imu_repeats=repeats,
         imu_clipped=clipped,
+        imu_unusable=unusable,
+        imu_unique_hz=unique_hz,
         imu_late_max_us=late_max_ns / 1000,
         edges=len(recording.edges.edges_ns),
     )

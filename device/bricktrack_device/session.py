@@ -13,6 +13,7 @@ from bricktrack_common.clocks import ClockTriplet, monotonic_ns, read_clock_trip
 from bricktrack_common.errors import BricktrackError, HardwareError
 from bricktrack_common.run_manifest import CameraSection, ClocksSection
 from bricktrack_device.config import DeviceConfig
+from bricktrack_device.edge_report import judge_edges
 from bricktrack_device.imu_reader import ImuReader
 from bricktrack_device.interfaces import Camera, Rig
 from bricktrack_device.recording import ImuRecording, Recording, RunLog
@@ -28,7 +29,10 @@ FIRST_KEYFRAME_TIMEOUT_S = 10.0
 RING_SLACK_S = 5.0
 LATE_FRAMES_GRACE_S = 1.0
 """How long after the window's end the last pictures may still come out of the encoder."""
+LATE_EDGES_GRACE_NS = 100_000_000
+"""How long after the window's end edges that were stamped within it may still be reported."""
 _SILENT_CAMERA_NS = 1_000_000_000
+_STUCK_HIGH_NS = 5_000_000_000
 _POLL_S = 0.01
 
 T = TypeVar("T")
@@ -75,6 +79,7 @@ class Session:
         self._imu_problems_told: set[str] = set()
         self._imu_resets_told: set[str] = set()
         self.trigger: Trigger | None = None
+        self._line_told = False
         self._t_armed_ns = 0
         self._arm_triplet: ClockTriplet | None = None
         self._trigger_triplet: ClockTriplet | None = None
@@ -93,7 +98,11 @@ class Session:
         """
         for table in self._config.imu:
             reader = ImuReader(
-                table, self._rig.bus_opener(table.bus), self._config.sampler, span_s=self._imu_span_s
+                table,
+                self._rig.bus_opener(table.bus),
+                self._config.sampler,
+                span_s=self._imu_span_s,
+                calibration_folder=self._config.calibration_folder,
             )
             self.imus.append(reader)
             reader.start()
@@ -144,6 +153,8 @@ class Session:
                 self._note_missing(f"imu {reader.name}: {reader.problem}")
             else:
                 self.log.add("imu started", name=reader.name, scheduling=reader.scheduling)
+                if (found := reader.description()) is not None and found.calibration_restored:
+                    self.log.add("imu calibration restored", name=reader.name, chip_id=found.chip_id)
                 for words in reader.warnings:
                     logger.warning("imu %s: %s", reader.name, words)
                     self.log.add("imu warning", name=reader.name, words=words)
@@ -182,6 +193,7 @@ class Session:
 
     def poll(self) -> None:
         """See how the sensors are, and note what was lost."""
+        self._watch_line()
         for reader in self.imus:
             reader.poll()
             if reader.problem and reader.name not in self._imu_problems_told:
@@ -199,6 +211,16 @@ class Session:
             self._camera_problem = f"no picture for {silent_ns / 1e9:.1f} s"
             self._note_missing(f"camera: {self._camera_problem}{self._when()}")
 
+    def _watch_line(self) -> None:
+        """Say once in the log that the line does not rest low."""
+        if self._line_told or self.t0_ns is not None or self.trigger is None:
+            return
+        if monotonic_ns() - self._t_armed_ns > _STUCK_HIGH_NS:
+            self._line_told = True
+            if self.trigger.line_is_high:
+                logger.warning("%s: trigger: %s", self.run_id, self.trigger.waiting_words())
+                self.log.add("line not low after arming", words=self.trigger.waiting_words())
+
     def note_trigger(self) -> None:
         """Log the clocks at the first edge."""
         self._trigger_triplet = read_clock_triplet()
@@ -212,7 +234,9 @@ class Session:
         if now_ns > end_ns + round(LATE_FRAMES_GRACE_S * 1e9):
             return True
         pictures_in = bool(self._camera_problem) or (self.ring.newest_us or 0) * 1000 >= end_ns
-        return pictures_in and all(i.has_slot_due_at(end_ns) for i in self.imus)
+        newest_edge_ns = self.trigger.newest_edge_ns if self.trigger else None
+        edges_in = (newest_edge_ns or 0) >= end_ns or now_ns > end_ns + LATE_EDGES_GRACE_NS
+        return pictures_in and edges_in and all(i.has_slot_due_at(end_ns) for i in self.imus)
 
     # Ending
 
@@ -226,16 +250,26 @@ class Session:
             self.log.add("interrupted", words=interrupted)
         if self.trigger is None:
             raise HardwareError("there is no run to collect: the trigger was never watched")
+        line_is_high = self.trigger.line_is_high
         edges = self.trigger.disarm()
-        self.missing += edges.problems
-        if edges.n_ignored:
-            self.log.add("edges before the first that counts", n=edges.n_ignored)
+        nominal_hz = self._config.trigger.nominal_hz
+        wave, wave_words = judge_edges(
+            edges.edges_ns,
+            nominal_hz=nominal_hz,
+            end_ns=until_ns,
+            rejected_ns=edges.rejected_ns,
+            line_is_high=line_is_high,
+        )
+        self.missing += edges.problems + wave_words
+        for t_ns in edges.rejected_ns:
+            self.log.add("rising edge before the first that counts", edge_ns=t_ns)
         imus = []
         for reader in self.imus:
             description = reader.description()
             if description is not None:
                 records = reader.records(start_ns, until_ns)
                 imus.append(ImuRecording(description, records, len(reader.slots_due(start_ns, until_ns))))
+                self.missing += imus[-1].problems()
         video = self._cut_video(start_ns, until_ns)
         if video is not None:
             self.missing += video.problems
@@ -254,8 +288,9 @@ class Session:
             video=video,
             imus=imus,
             trigger_pin=self.trigger.pin_name,
-            nominal_hz=self._config.trigger.nominal_hz,
+            nominal_hz=nominal_hz,
             edges=edges,
+            wave=wave,
             clocks=ClocksSection(arm=self._arm_triplet, trigger=self._trigger_triplet, end=end_triplet),
             window_ns=(start_ns, end_ns),
             missing=list(self.missing),

@@ -1,4 +1,4 @@
-"""The square wave's edges, as stamped where they happened: the first one after arming is t = 0.
+"""The square wave's edges, as stamped where they happened: the wave's first one after arming is t = 0.
 
 gpiozero's ``when_activated`` hands on no stamp, so the pin-level hook is taken: it is called with the edge's
 time in seconds (the kernel's stamp under the lgpio factory) and the level. That hook holds a **weak**
@@ -8,13 +8,14 @@ reference, hence the bound method of an object that the recorder keeps.
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gpiozero
 
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_device.config import TriggerTable
+from bricktrack_device.first_edge import FirstEdgeFinder
 
 logger = logging.getLogger(__name__)
 
@@ -32,9 +33,11 @@ class EdgeTrain:
     t0_ns : int or None
         The first edge that counts.
     edges_ns : list of int
-        That edge and every later rising one.
+        That edge and every later rising one, in step or not.
     n_ignored : int
-        Rising edges before it that did not count: line not seen low, or no quiet gap.
+        Rising edges before it that did not count: line not seen low, no quiet gap, or out of step.
+    rejected_ns : list of int
+        The newest of these.
     problems : list of str
     """
 
@@ -42,6 +45,7 @@ class EdgeTrain:
     edges_ns: list[int]
     n_ignored: int
     problems: list[str]
+    rejected_ns: list[int] = field(default_factory=list)
 
 
 class Trigger:
@@ -74,7 +78,8 @@ class Trigger:
         self._last_change_ns = 0
         self._t0_ns: int | None = None
         self._edges_ns: list[int] = []
-        self._n_ignored = 0
+        self._finder = self._new_finder()
+        self._newest_rising_ns = 0
         self._n_out_of_order = 0
         self._n_off_clock = 0
         self._worst_off_ns = 0
@@ -110,6 +115,39 @@ class Trigger:
         """Rising edges logged so far, the first included."""
         return len(self._edges_ns)
 
+    @property
+    def newest_edge_ns(self) -> int | None:
+        """Stamp of the newest edge of the train; `None` before the first that counts."""
+        with self._lock:
+            return self._edges_ns[-1] if self._edges_ns else None
+
+    def waiting_words(self) -> str:
+        """Return in words what the line does while the first edge is waited for; ``""`` once it has come."""
+        if self._armed_ns is None or self._t0_ns is not None:
+            return ""
+        is_high = self.line_is_high
+        with self._lock:
+            now, armed_ns, finder = self._clock(), self._armed_ns, self._finder
+            if armed_ns is None:
+                return ""
+            never_low = self._low_since_ns is None
+            provisional, n_rejected = finder.provisional_t0_ns, finder.n_rejected
+            since_s = (now - armed_ns) / 1e9
+            unchanged_s = (now - self._last_change_ns) / 1e9
+        level = "high" if is_high else "low"
+        if never_low and is_high and self._settings.require_low:
+            words = (
+                f"armed for {since_s:.0f} s and the line was high all the time: nothing can trigger until it "
+                "goes low. Check the wiring, or that the wave rests low"
+            )
+        else:
+            words = f"armed for {since_s:.0f} s; the line is {level}, unchanged for {unchanged_s:.0f} s"
+        if provisional is not None:
+            words += f"; an edge {(now - provisional) / 1e9:.1f} s ago waits for others in step"
+        if n_rejected:
+            words += f"; {n_rejected} edges did not count"
+        return words
+
     def arm(self, on_first_edge: Callable[[], None]) -> int:
         """Wait for the first edge from now on, and call ``on_first_edge`` from the pin's thread then.
 
@@ -126,7 +164,9 @@ class Trigger:
             self._low_since_ns = None if self.line_is_high else now
             self._t0_ns = None
             self._edges_ns = []
-            self._n_ignored = self._n_out_of_order = self._n_off_clock = self._worst_off_ns = 0
+            self._finder = self._new_finder()
+            self._newest_rising_ns = 0
+            self._n_out_of_order = self._n_off_clock = self._worst_off_ns = 0
             return now
 
     def disarm(self) -> EdgeTrain:
@@ -146,6 +186,10 @@ class Trigger:
         with self._close_lock:
             self._device.close()
 
+    def _new_finder(self) -> FirstEdgeFinder:
+        s = self._settings
+        return FirstEdgeFinder(1e9 / s.nominal_hz if s.nominal_hz else None, round(s.quiet_gap_ms * 1e6))
+
     def _train(self) -> EdgeTrain:
         problems = []
         if self._n_out_of_order:
@@ -159,7 +203,8 @@ class Trigger:
             )
         if len(self._edges_ns) >= MAX_EDGES:
             problems.append(f"trigger: only the first {MAX_EDGES} edges were kept")
-        return EdgeTrain(self._t0_ns, list(self._edges_ns), self._n_ignored, problems)
+        finder = self._finder
+        return EdgeTrain(self._t0_ns, list(self._edges_ns), finder.n_rejected, problems, finder.rejected_ns)
 
     def _on_change(self, ticks_s: float, state: int) -> None:
         """Take one change of the line; called by gpiozero, in the pin's thread."""
@@ -183,24 +228,28 @@ class Trigger:
             first_edge()
 
     def _take_rising(self, t_ns: int) -> bool:
-        """Log one rising edge; tell whether it is the first that counts."""
+        """Log one rising edge; tell whether the first one that counts is known by it."""
         if self._t0_ns is not None:
             if t_ns <= self._edges_ns[-1]:
                 self._n_out_of_order += 1
             elif len(self._edges_ns) < MAX_EDGES:
                 self._edges_ns.append(t_ns)
             return False
-        seen_low = self._low_since_ns is not None or not self._settings.require_low
-        quiet_ns = t_ns - self._last_change_ns
-        since = self._low_since_ns if self._low_since_ns is not None else self._armed_ns
-        if (
-            not seen_low
-            or since is None
-            or t_ns < since
-            or quiet_ns < round(self._settings.quiet_gap_ms * 1e6)
-        ):
-            self._n_ignored += 1
+        if t_ns <= self._newest_rising_ns:
+            self._n_out_of_order += 1
             return False
-        self._t0_ns = t_ns
-        self._edges_ns.append(t_ns)
+        self._newest_rising_ns = t_ns
+        armed_ns = self._armed_ns or 0
+        seen_low = self._low_since_ns is not None or not self._settings.require_low
+        since_ns = self._low_since_ns if self._low_since_ns is not None else armed_ns
+        if not seen_low or t_ns < since_ns:
+            self._finder.reject(t_ns)
+            return False
+        believed = self._finder.take(
+            t_ns, quiet_ns=t_ns - self._last_change_ns, since_armed_ns=t_ns - armed_ns
+        )
+        if believed is None:
+            return False
+        self._edges_ns = believed.edges_ns
+        self._t0_ns = believed.t0_ns
         return True

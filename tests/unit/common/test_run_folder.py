@@ -115,7 +115,7 @@ def test_a_folder_without_a_manifest_is_no_run(folder):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"version": 2}, r"bricktrack\.run version 2; this bricktrack reads up to version 1"),
+        ({"version": 3}, r"bricktrack\.run version 3; this bricktrack reads up to version 2"),
         ({"version": "1"}, "version '1'; expected a positive integer"),
         ({"schema": "other"}, r"not a bricktrack\.run manifest"),
         ({"run_id": "../../etc/passwd"}, "run_id: Expected `str` matching"),
@@ -137,3 +137,13 @@ def test_a_wrong_manifest_is_refused(change, words):
 def test_a_manifest_that_is_no_json_is_refused():
     with pytest.raises(RunFormatError, match="m: not valid JSON"):
         parse_manifest(b"\xff{", where="m")
+
+
+def test_a_manifest_of_version_1_is_read_with_what_it_did_not_say_yet():
+    data = msgspec.to_builtins(manifest([]))
+    data["version"] = 1
+    del data["trigger"]["wave"]
+    for key in ("imu_unusable", "imu_unique_hz"):
+        del data["quality"][key]
+    read = parse_manifest(json.dumps(data).encode(), where="m")
+    assert read.trigger.wave is None and read.quality.imu_unique_hz == {} and read.quality.imu_unusable == 0

@@ -14,7 +14,7 @@ from bricktrack_common.errors import StorageError
 from bricktrack_common.frame_times import FrameRecord
 from bricktrack_common.imu_records import ImuDescription, ImuRecord
 from bricktrack_common.run_folder import read_run
-from bricktrack_common.run_manifest import CameraSection, ClocksSection, RunManifest
+from bricktrack_common.run_manifest import CameraSection, ClocksSection, RunManifest, WaveSection
 from bricktrack_device.interfaces import EncodedPacket
 from bricktrack_device.recording import ImuRecording, Recording, RunLog, save
 from bricktrack_device.recovery import rebuild_manifest
@@ -98,7 +98,7 @@ def recording(run_id: str) -> Recording:
     return Recording(
         run_id=run_id, unit="unit-1", label="", state="complete", simulated=True, hardware={}, camera=camera,
         video=VideoCut(packets, frames, 0, 0, []), imus=[ImuRecording(description, samples, 20)],
-        trigger_pin="GPIO17", nominal_hz=None, edges=EdgeTrain(T0, [T0, T0 + 20_000_000], 0, []),
+        trigger_pin="GPIO17", nominal_hz=None, edges=EdgeTrain(T0, [T0, T0 + 20_000_000], 0, []), wave=WaveSection(),
         clocks=ClocksSection(), window_ns=(T0, T0 + 400_000_000), missing=[], log=log,
     )  # fmt: skip
 
