@@ -26,6 +26,7 @@ _Words = Annotated[str, msgspec.Meta(max_length=2000)]
 _Sha256 = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}$")]
 
 DaemonState = Literal["idle", "armed", "recording", "saving", "fault"]
+HealthLevel = Literal["ok", "warn", "fail"]
 ErrorCode = Literal[
     "bad-message", "bad-version", "busy", "no-such-run", "no-such-file", "out-of-range", "hash-mismatch",
     "no-space", "not-ready", "wrong-state", "internal",
@@ -115,6 +116,15 @@ class ImuStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     problem: _Words = ""
 
 
+class HealthItem(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How one part of a unit is: ``warn`` makes runs worse, with ``fail`` it cannot work."""
+
+    name: Annotated[str, msgspec.Meta(max_length=64)]
+    level: HealthLevel
+    words: _Words
+    remedy: _Words = ""
+
+
 class StatusReply(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="status-reply"):
     """How the unit is."""
 
@@ -132,6 +142,8 @@ class StatusReply(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, 
     line_is_high: bool | None = None
     temperature_degc: float | None = None
     last_error: _Words = ""
+    health: Annotated[list[HealthItem], msgspec.Meta(max_length=64)] = []
+    health_age_s: Annotated[float, msgspec.Meta(ge=0)] | None = None
     clocks: ClockTriplet
 
 

@@ -74,13 +74,13 @@ def check(
     unit: UnitOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
-    """Try every part of this unit; exit with 1 if one fails. Not while the daemon runs."""
-    import msgspec
-    from rich.console import Console
-    from rich.table import Table
+    """Try every part of this unit; exit with 1 if one fails. Not while the daemon runs.
 
+    Takes some ten seconds: the camera streams, the trigger's line is listened to, the card is written to.
+    """
     from bricktrack_device.backends import open_rig
     from bricktrack_device.checks import run_checks
+    from bricktrack_device.health.report import as_report, print_table
 
     settings = _load(config, backend=backend, storage=storage, port=port, unit=unit)
     rig = open_rig(settings)
@@ -88,25 +88,12 @@ def check(
         results = run_checks(settings, rig)
     finally:
         rig.close()
-    all_ok = all(r.ok for r in results)
+    report = as_report(settings.unit.name, results, simulated=rig.simulated)
     if as_json:
-        report = {
-            "unit": settings.unit.name,
-            "simulated": rig.simulated,
-            "ok": all_ok,
-            "checks": [msgspec.to_builtins(r) for r in results],
-        }
-        sys.stdout.write(msgspec.json.format(msgspec.json.encode(report), indent=2).decode() + "\n")
+        _print_json(report)
     else:
-        simulated = " (simulated)" if rig.simulated else ""
-        table = Table(title=f"Unit {settings.unit.name}{simulated}", title_justify="left")
-        for column in ("", "part", "found"):
-            table.add_column(column, overflow="fold")
-        for r in results:
-            found = r.detail if r.ok else f"{r.detail}\n[bold]{r.remedy}[/bold]"
-            table.add_row("[green]ok[/green]" if r.ok else "[red]FAILED[/red]", r.name, found)
-        Console().print(table)
-    raise typer.Exit(0 if all_ok else 1)
+        print_table(report)
+    raise typer.Exit(0 if report.ok else 1)
 
 
 @app.command("sim-kit", epilog="Example:\n\n  bricktrackd sim-kit ./kit --config sim.toml\n")
@@ -136,6 +123,12 @@ def _load(
             "unit.name": unit,
         },
     )
+
+
+def _print_json(report: object) -> None:
+    import msgspec
+
+    sys.stdout.write(msgspec.json.format(msgspec.json.encode(report), indent=2).decode() + "\n")
 
 
 def main() -> None:

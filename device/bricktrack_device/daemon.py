@@ -28,6 +28,8 @@ from bricktrack_common.wire_messages import (
 )
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.file_server import Answer, FileServer
+from bricktrack_device.health.machine import processor_temperature_degc
+from bricktrack_device.health.watch import HealthWatch
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.recorder import Recorder
 from bricktrack_device.recovery import rebuild_manifest
@@ -42,7 +44,6 @@ MAX_BEAT_AGE_S = 8.0
 """A thread that did nothing for so long hangs: systemd's watchdog is not fed any more."""
 MAX_SAVING_S = 60.0
 """A slow card may take so long for one run."""
-_THERMAL = Path("/sys/class/thermal/thermal_zone0/temp")
 
 
 class UnitService:
@@ -51,6 +52,7 @@ class UnitService:
     def __init__(self, config: DeviceConfig, rig: Rig, recorder: Recorder, store: RunStore) -> None:
         self._config = config
         self._rig = rig
+        self.health = HealthWatch(config, rig)
         self._recorder = recorder
         self._store = store
 
@@ -118,8 +120,10 @@ class UnitService:
             imus=recorder.imus,
             edges=recorder.edges,
             line_is_high=recorder.line_is_high,
-            temperature_degc=_processor_temperature_degc(),
+            temperature_degc=processor_temperature_degc(),
             last_error=recorder.last_error,
+            health=list(self.health.items),
+            health_age_s=self.health.age_s,
             clocks=read_clock_triplet(),
         )
 
@@ -163,12 +167,13 @@ class Daemon:
             if threading.current_thread() is threading.main_thread():
                 for number in (signal.SIGTERM, signal.SIGINT):
                     signal.signal(number, self.stop)
-            self._serve(recorder, server, store.folder)
+            service.health.refresh_if_due(recorder.state)
+            self._serve(recorder, server, service.health, store.folder)
         finally:
             store.unlock()
             self._rig.close()
 
-    def _serve(self, recorder: Recorder, server: FileServer, folder: Path) -> None:
+    def _serve(self, recorder: Recorder, server: FileServer, health: HealthWatch, folder: Path) -> None:
         recorder.start()
         server.start()
         self.port = server.port
@@ -183,15 +188,9 @@ class Daemon:
                 limit_s = MAX_SAVING_S if recorder.state == "saving" else MAX_BEAT_AGE_S
                 if recorder.beat_age_s < limit_s and server.beat_age_s < MAX_BEAT_AGE_S:
                     notify(f"WATCHDOG=1\nSTATUS={recorder.state}")
+                health.refresh_if_due(recorder.state)
         finally:
             notify("STOPPING=1")
             logger.info("stopping")
             recorder.stop()
             server.stop()
-
-
-def _processor_temperature_degc() -> float | None:
-    try:
-        return int(_THERMAL.read_text(encoding="ascii")) / 1000
-    except (OSError, ValueError):
-        return None

@@ -1,11 +1,14 @@
 """What the daemon needs of the hardware: protocols that the real parts and the simulated ones both meet."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from types import TracebackType
+from typing import Protocol, Self
 
 import gpiozero
+import numpy as np
+from numpy.typing import NDArray
 
 from bricktrack_common.run_manifest import CameraSection
 
@@ -37,6 +40,23 @@ class FrameMetadata:
     frame_duration_us: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Still:
+    """One picture, not encoded: YUV 4:2:0, limited range.
+
+    Attributes
+    ----------
+    luma : ndarray of uint8, shape (height, width)
+        16 is black, 235 white.
+    chroma_u, chroma_v : ndarray of uint8, shape (height/2, width/2)
+        128 is grey.
+    """
+
+    luma: NDArray[np.uint8]
+    chroma_u: NDArray[np.uint8]
+    chroma_v: NDArray[np.uint8]
+
+
 class FrameSink(Protocol):
     """Where a camera hands its frames to. Both calls come from the camera's threads and must not block."""
 
@@ -62,9 +82,31 @@ class Camera(Protocol):
         """
         ...
 
+    def still(self) -> Still | None:
+        """Return a picture of now while streaming; `None` where none can be had. Never waits for long."""
+        ...
+
     def stop(self) -> None:
         """Stop streaming; frames under way may be lost. Calling it twice does no harm."""
         ...
+
+
+class Leds(Protocol):
+    """LEDs that the unit can switch, all together; as a context it switches them off in the end."""
+
+    def switch(self, on: bool) -> tuple[int, int]:
+        """Switch; return CLOCK_MONOTONIC before and after, ns."""
+        ...
+
+    def close(self) -> None:
+        """Switch off and give the pins back. Calling it twice does no harm."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
 
 
 class I2cBus(Protocol):
@@ -123,6 +165,10 @@ class Rig(Protocol):
 
     def bus_opener(self, bus: str) -> BusOpener:
         """Return what opens the named I2C bus."""
+        ...
+
+    def leds(self, pins: Sequence[str], *, active_high: bool = True) -> Leds:
+        """Return the LEDs on some pins, switched off; raise `HardwareError` where a pin cannot be had."""
         ...
 
     def on_armed(self, t_armed_ns: int) -> None:

@@ -16,7 +16,15 @@ from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_manifest import CameraSection
-from bricktrack_device.interfaces import BusOpener, Camera, EncodedPacket, FrameMetadata, FrameSink, I2cBus
+from bricktrack_device.interfaces import (
+    BusOpener,
+    Camera,
+    EncodedPacket,
+    FrameMetadata,
+    FrameSink,
+    I2cBus,
+    Still,
+)
 
 
 @dataclass
@@ -149,6 +157,7 @@ class FakeCamera:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self.n_stops = 0
+        self.picture: Still | None = None
 
     def start(self, sink: FrameSink) -> CameraSection:
         if self.fail:
@@ -160,6 +169,9 @@ class FakeCamera:
             model="fake", mode=IMX219_1080P, exposure_us=2000, analogue_gain=1.0, colour_gains=(1.0, 1.0),
             frame_duration_us=self.period_us, encoder="none", encoder_settings={},
         )  # fmt: skip
+
+    def still(self) -> Still | None:
+        return self.picture
 
     def stop(self) -> None:
         self.n_stops += 1

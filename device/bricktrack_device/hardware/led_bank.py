@@ -1,6 +1,8 @@
 """LEDs on GPIO pins, switched together: for focusing, background pictures and the timing self-test."""
 
 from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
 
 import gpiozero
 
@@ -45,3 +47,13 @@ class LedBank:
         """Switch off and give the pins back. Calling it twice does no harm."""
         while self._leds:
             self._leds.pop().close()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Switch off and give the pins back."""
+        self.close()

@@ -22,7 +22,8 @@ from bricktrack_device.hardware.h264 import EncoderSettings, make_encoder
 from bricktrack_device.hardware.packet_tap import MetadataTap, PacketTap, output_of
 from bricktrack_device.hardware.sensor_subdev import read_line_timing
 from bricktrack_device.hardware.versions import require
-from bricktrack_device.interfaces import FrameSink
+from bricktrack_device.hardware.yuv import split_i420
+from bricktrack_device.interfaces import FrameSink, Still
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +33,7 @@ _SETTLE_S = 10.0
 _FIRST_PACKET_S = 10.0
 _STOP_S = 4.5
 """For all the steps of stopping together; the daemon gives up after 5 s."""
+_STILL_S = 2.0
 _SILENT_NS = 1_000_000_000
 
 LineTimeReader = Callable[[str, str], float]
@@ -194,6 +196,21 @@ class PiCamera:
                 f"{_because(self._packets.last_error)}. Check that no other program uses the encoder, and "
                 "'dmesg' for its driver"
             )
+
+    def still(self) -> Still | None:
+        """Return a picture of now; `None` where the camera does not stream or does not answer in time."""
+        picam2 = self._picam2
+        if picam2 is None or not self._event_loop_alive():
+            return None
+        taken: list[Any] = []
+        try:
+            in_time = finishes(
+                lambda: taken.append(picam2.capture_array("main")), within_s=_STILL_S, name="camera: still"
+            )
+        except (RuntimeError, OSError, ValueError) as e:
+            logger.warning("camera: no still: %s", e)
+            return None
+        return split_i420(taken[0], self._settings.mode.picture_size) if in_time else None
 
     def problem(self) -> str | None:
         """Return what is wrong with a camera that should stream, or `None`.

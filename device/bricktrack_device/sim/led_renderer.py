@@ -9,6 +9,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_device.sim.dome import clearance_mm, foot_mm
+from bricktrack_device.sim.led_switch import LedSwitch
 from bricktrack_device.sim.lens import Lens
 from bricktrack_device.sim.scene import BAND_ROWS, LIGHT_OF_LUMA, Plane, Scene, Single, noise_sd, to_luma
 from bricktrack_device.sim.settings import SimSettings
@@ -36,11 +37,21 @@ class LedRenderer:
     lens : Lens
     mode : SensorMode
     exposure_ns : int
+    switch : LedSwitch or None
+        When the LEDs glow; `None`: always.
     """
 
     def __init__(
-        self, settings: SimSettings, world: SimWorld, *, lens: Lens, mode: SensorMode, exposure_ns: int
+        self,
+        settings: SimSettings,
+        world: SimWorld,
+        *,
+        lens: Lens,
+        mode: SensorMode,
+        exposure_ns: int,
+        switch: LedSwitch | None = None,
     ) -> None:
+        self._switch = switch
         self._settings = settings
         self._world = world
         self._lens = lens
@@ -48,7 +59,7 @@ class LedRenderer:
         self._exposure_ns = exposure_ns
         slopes = lens.pixel_slopes
         self._x, self._y = (np.ascontiguousarray(slopes[..., i], dtype=np.float32) for i in (0, 1))
-        delays_ns = mode.row_delay_ns(np.arange(mode.height))
+        delays_ns = self._delays_ns = mode.row_delay_ns(np.arange(mode.height))
         self._first_delay_ns = float(delays_ns.min())
         self._step_ns = _POSE_STEP_ROWS * mode.line_time_ns
         # When rows' exposures begin, in steps of the pose grid; mid-exposure is half an exposure later.
@@ -83,9 +94,11 @@ class LedRenderer:
         uv = self._lens.project(centres)
         picture = self._scene.picture(self._wall_shifts(uv))
         lit = np.where(self._world.leds_hidden(grid_ns), 0.0, 1.0)
+        end_ns = sensor_timestamp_ns + self._delays_ns
+        glow = None if self._switch is None else self._switch.share_lit(end_ns - self._exposure_ns, end_ns)
         for i in range(centres.shape[1]):
             if lit[:, i].any():
-                self._draw(picture, i, centres[:, i], axes[:, i], uv[:, i], lit[:, i])
+                self._draw(picture, i, centres[:, i], axes[:, i], uv[:, i], lit[:, i], glow)
         if cover.max() > 0:
             self._draw_card(picture, self._at(cover[:, None], np.arange(self._mode.height), 0.5)[:, 0])
         return picture
@@ -131,6 +144,7 @@ class LedRenderer:
         axes: FloatArray,
         uv: FloatArray,
         lit: FloatArray,
+        switched: FloatArray | None,
     ) -> None:
         brick, level = self._world.brick, np.float32(self._settings.led_level)
         radius, collar = float(brick.led_radii_mm[i_led]), self._settings.collar_mm
@@ -162,6 +176,8 @@ class LedRenderer:
             glow += share * bright
         fall_off = 1 / (1 + x * x + y * y)  # the lens is darker towards the corners
         led: Single = np.asarray(level / np.float32(n) * glow * fall_off, dtype=np.float32)
+        if switched is not None:
+            led *= switched[rows, None].astype(np.float32)
         first = int(self._rng.integers(0, self._noise.size - x.size))
         noise = self._noise[first : first + x.size].reshape(x.shape)
         grain = noise_sd(led, self._settings) * noise * (covered > 0)

@@ -14,8 +14,9 @@ from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_manifest import CameraSection
-from bricktrack_device.interfaces import FrameMetadata, FrameSink
+from bricktrack_device.interfaces import FrameMetadata, FrameSink, Still
 from bricktrack_device.sim.led_renderer import LedRenderer
+from bricktrack_device.sim.led_switch import LedSwitch
 from bricktrack_device.sim.lens import lens_of
 from bricktrack_device.sim.scene import Plane
 from bricktrack_device.sim.video_encoder import VideoEncoder
@@ -34,14 +35,16 @@ _BUFFERS = 6  # as picamera2's video configuration has
 class SimCamera:
     """A simulated IMX219 in its 1080p mode, meeting `interfaces.Camera`."""
 
-    def __init__(self, world: SimWorld, settings: "CameraTable") -> None:
+    def __init__(self, world: SimWorld, settings: "CameraTable", switch: LedSwitch | None = None) -> None:
         self._world = world
+        self._switch = switch
         self._settings = settings
         self._mode = IMX219_1080P
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
         self._to_encode: queue.Queue[tuple[int, Plane] | None] = queue.Queue()
         self.frames_dropped = 0
+        self._newest: Still | None = None
 
     def start(self, sink: FrameSink) -> CameraSection:
         """Begin to stream; raise `HardwareError` if it streams already or no encoder can be had."""
@@ -57,6 +60,7 @@ class SimCamera:
             lens=lens_of(self._world.settings.seed),
             mode=mode,
             exposure_ns=exposure_us * 1000,
+            switch=self._switch,
         )
         encoder = VideoEncoder(s, mode.width, mode.height)
         self._stopping.clear()
@@ -81,12 +85,17 @@ class SimCamera:
             encoder_settings=encoder.settings,
         )
 
+    def still(self) -> Still | None:
+        """Return the newest picture; `None` while none streams."""
+        return self._newest
+
     def stop(self) -> None:
         """Stop streaming. Calling it twice does no harm."""
         self._stopping.set()
         for thread in self._threads:
             thread.join(timeout=5)
         self._threads = []
+        self._newest = None
 
     def _film(self, renderer: LedRenderer, sink: FrameSink, period_ns: float, exposure_us: int) -> None:
         """Render each frame when its read-out is over; skip frames when all buffers' time has passed."""
@@ -106,7 +115,9 @@ class SimCamera:
             if dropped or wait_s < -_BUFFERS * period_ns * 1e-9 or self._to_encode.full():
                 self.frames_dropped += 1
                 continue
-            self._to_encode.put((stamp, renderer.luma(stamp)))
+            luma = renderer.luma(stamp)
+            self._newest = Still(luma, renderer.chroma_u, renderer.chroma_v)
+            self._to_encode.put((stamp, luma))
             gain = self._settings.analogue_gain
             sink.on_metadata(FrameMetadata(stamp, exposure_us, gain, round(period_ns / 1000)))
         self._to_encode.put(None)

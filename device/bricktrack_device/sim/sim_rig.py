@@ -16,6 +16,7 @@ from bricktrack_common.rotations import continuous_quaternions, quaternion_from_
 from bricktrack_common.run_manifest import TRUTH_NAME
 from bricktrack_device.interfaces import BusOpener, Camera
 from bricktrack_device.sim.imu_signal import ACC_LAG_S, GYRO_LAG_S, chip_period_s, sensor_biases
+from bricktrack_device.sim.led_switch import LedSwitch, SimLeds
 from bricktrack_device.sim.lens import lens_of
 from bricktrack_device.sim.sim_camera import SimCamera
 from bricktrack_device.sim.sim_i2c import SimBusOpener, bus_stream
@@ -39,13 +40,14 @@ class SimRig:
         self._camera = camera
         self._epoch = make_epoch()
         self.world = SimWorld(settings, self._epoch)
+        self.led_switch = LedSwitch()
         self._factory = make_factory()
         self._buses: list[str] = []
         self._wave = SquareWave(self.world, self._factory)
 
     def open_camera(self) -> Camera:
         """Return the camera, not yet started."""
-        return SimCamera(self.world, self._camera)
+        return SimCamera(self.world, self._camera, self.led_switch)
 
     def pin_factory(self) -> gpiozero.Factory:
         """Return the mock factory whose pins the square wave drives."""
@@ -56,6 +58,10 @@ class SimRig:
         if bus not in self._buses:
             self._buses.append(bus)
         return SimBusOpener(self._settings, self._epoch, bus)
+
+    def leds(self, pins: Sequence[str], *, active_high: bool = True) -> SimLeds:
+        """Return the simulated LEDs, switched off; whatever the pins are called, they hang on them."""
+        return SimLeds(self.led_switch)
 
     def on_armed(self, t_armed_ns: int) -> None:
         """Let the table start: schedule the first edge, and drive the line from there on."""

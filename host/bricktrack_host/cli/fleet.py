@@ -29,6 +29,7 @@ _STATE_STYLES = {
     "saving": "cyan",
     "fault": "red",
 }
+_HEALTH_STYLES = {"warn": "yellow", "fail": "red"}
 
 
 def status(
@@ -77,12 +78,13 @@ def _print_table(units: list[UnitConfig], answers: list[StatusReply | Bricktrack
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name, justify in (
         ("unit", "left"), ("state", "left"), ("runs", "right"), ("free", "right"), ("frames", "right"),
-        ("edges", "right"), ("line", "left"), ("imus", "left"), ("temp", "right"), ("note", "left"),
+        ("edges", "right"), ("line", "left"), ("imus", "left"), ("temp", "right"), ("health", "left"),
+        ("note", "left"),
     ):  # fmt: skip
         table.add_column(name, justify="right" if justify == "right" else "left")
     for unit, answer in zip(units, answers, strict=True):
         if isinstance(answer, BricktrackError):
-            table.add_row(unit.name, "[red]no answer[/]", *[""] * 8)
+            table.add_row(unit.name, "[red]no answer[/]", *[""] * 9)
             continue
         style = _STATE_STYLES[answer.state]
         table.add_row(
@@ -96,12 +98,30 @@ def _print_table(units: list[UnitConfig], answers: list[StatusReply | Bricktrack
             {True: "high", False: "low", None: "?"}[answer.line_is_high],
             " ".join(_plain(f"{i.name} {i.problem or _samples(i.samples, i.gaps)}") for i in answer.imus),
             "" if answer.temperature_degc is None else f"{answer.temperature_degc:.0f} °C",
+            _health(answer),
             _plain("; ".join(t for t in (answer.run_id, answer.reason, answer.last_error) if t)),
         )
     out.print(table)
     for answer in answers:
         if isinstance(answer, BricktrackError):
             say_error(str(answer))
+            continue
+        for item in answer.health:
+            if item.level != "ok":
+                words = f"{answer.unit}: {item.level}: {item.name}: {item.words}. {item.remedy}"
+                err.print(words, style=_HEALTH_STYLES[item.level], markup=False)
+
+
+def _health(answer: StatusReply) -> str:
+    """Return the worst level of a unit's health, and of what; empty for a unit that tells none."""
+    if not answer.health:
+        return ""
+    bad = [item for item in answer.health if item.level != "ok"]
+    if not bad:
+        return "[green]ok[/]"
+    level = "fail" if any(item.level == "fail" for item in bad) else "warn"
+    names = ", ".join(item.name for item in bad if item.level == level)
+    return f"[{_HEALTH_STYLES[level]}]{level}[/]: {_plain(names)}"
 
 
 def _samples(samples: int, gaps: int) -> str:

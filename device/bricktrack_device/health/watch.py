@@ -1,0 +1,96 @@
+"""The cheap part of the check, looked at now and then by the daemon, for its status.
+
+While the unit is armed, records or saves nothing is looked at: the status then says how old the findings are.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from bricktrack_common.wire_messages import DaemonState, HealthItem
+from bricktrack_device.config import DeviceConfig
+from bricktrack_device.health import machine, storage
+from bricktrack_device.health.findings import CheckResult, tried
+from bricktrack_device.health.inertial import check_adapter
+from bricktrack_device.interfaces import Rig
+
+logger = logging.getLogger(__name__)
+
+PERIOD_S = 30.0
+_QUIET_STATES: tuple[DaemonState, ...] = ("idle", "fault")
+
+
+class HealthWatch:
+    """Findings of the cheap checks, kept fresh by `refresh_if_due`.
+
+    Parameters
+    ----------
+    config : DeviceConfig
+    rig : Rig
+    period_s : float
+    clock : callable
+        Seconds, monotonic.
+    """
+
+    def __init__(
+        self,
+        config: DeviceConfig,
+        rig: Rig,
+        *,
+        period_s: float = PERIOD_S,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._config = config
+        self._rig = rig
+        self._period_s = period_s
+        self._clock = clock
+        # What cannot change while the daemon runs is looked at once.
+        self._lasting: list[CheckResult] | None = None
+        self._found: tuple[float, list[CheckResult]] | None = None
+
+    def refresh_if_due(self, state: DaemonState) -> bool:
+        """Look again if it is time and the unit has nothing better to do; tell whether it did."""
+        now = self._clock()
+        if state not in _QUIET_STATES:
+            return False
+        if self._found is not None and now - self._found[0] < self._period_s:
+            return False
+        before = {} if self._found is None else {r.name: r.level for r in self._found[1]}
+        results = self._look()
+        self._found = now, results
+        for r in results:
+            if r.level != "ok" and before.get(r.name) != r.level:
+                logger.warning("health: %s: %s. %s", r.name, r.detail, r.remedy)
+        return True
+
+    @property
+    def items(self) -> Sequence[HealthItem]:
+        """The newest findings; none before the first look. Safe from any thread."""
+        found = self._found
+        return [] if found is None else [r.as_item() for r in found[1]]
+
+    @property
+    def age_s(self) -> float | None:
+        """How old they are, s."""
+        found = self._found
+        return None if found is None else max(0.0, self._clock() - found[0])
+
+    def _look(self) -> list[CheckResult]:
+        if self._lasting is None:
+            self._lasting = self._look_once()
+        results = tried("clocks", "Reboot the unit and disable suspend", machine.check_clocks)
+        results += tried("storage", "Set storage.folder", lambda: storage.check_space(self._config))
+        results += machine.check_temperature()
+        results += machine.check_throttling(machine.read_throttled())
+        return results + self._lasting
+
+    def _look_once(self) -> list[CheckResult]:
+        results = machine.check_realtime(self._config.sampler)
+        if not self._rig.simulated:
+            results += machine.check_permissions([imu.bus for imu in self._config.imu])
+            for imu in self._config.imu:
+                self._rig.bus_opener(imu.bus)
+            described = self._rig.describe()
+            for imu in self._config.imu:
+                results += check_adapter(imu, described, simulated=False)
+        return results
