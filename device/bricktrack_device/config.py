@@ -80,17 +80,6 @@ class LedsTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
     active_high: bool = True
 
 
-class LedsTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``[leds]``: how many LEDs the camera looks at, and the pins that switch them, if they hang on any.
-
-    ``active_high = false`` where a pin sinks the current. A simulated unit has LEDs on any pin.
-    """
-
-    count: Annotated[int, msgspec.Meta(ge=1, le=64)] = 7
-    pins: list[Annotated[str, msgspec.Meta(pattern=r"^(GPIO|BCM|BOARD)?[0-9]{1,2}$")]] = []
-    active_high: bool = True
-
-
 class TriggerTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``[trigger]``: the pin of the square wave, and which edge counts as the first.
 
