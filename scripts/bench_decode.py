@@ -4,6 +4,8 @@ Runs both by turns with the same number of threads and prints the ratio of their
 either on a machine with other work:
 
     python scripts/bench_decode.py runs/sample_motion --threads 2
+
+Without a run it takes the simulated recording of ``bench_process.py``.
 """
 
 import argparse
@@ -33,13 +35,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", type=Path)
+    parser.add_argument("run", type=Path, nargs="?")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeat", type=int, default=5)
     options = parser.parse_args()
-    run = read_run(options.run)
+    folder = options.run
+    if folder is None:
+        from bench_process import simulated_recording
+
+        folder, _, _ = simulated_recording()
+    run = read_run(folder)
     if run.video is None or run.frames is None:
-        raise SystemExit(f"{options.run}: no video with frame times")
+        raise SystemExit(f"{folder}: no video with frame times")
+    print(("Simulated recording" if run.manifest.simulated else "Recording") + f" {folder.name}")
     wall: dict[str, list[float]] = {"bare": [], "paired": []}
     cpu: dict[str, list[float]] = {"bare": [], "paired": []}
     n_bare = n_paired = 0

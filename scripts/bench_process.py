@@ -1,0 +1,141 @@
+"""How long processing a run takes beside FFmpeg's bare decode of its video, on a simulated recording.
+
+The first time, 15 s are recorded with ``bricktrack demo``: the real daemon, simulated sensors, the pull. The
+recording stays under the system's temporary directory for the next time. Then, by turns in one process, the
+video is decoded with as many threads and nothing done with its pictures, and the whole run is processed, from
+reading it to its report. Ratios say more than times on a machine with other work:
+
+    python scripts/bench_process.py
+    python scripts/bench_process.py --run runs/b2_9f31c2_0007_shake --calibration b2.json --layout brick.toml
+"""
+
+import argparse
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before NumPy is loaded
+
+from bench_decode import bare_decode
+
+from bricktrack_common.run_folder import Run, read_run
+from bricktrack_host.pipeline import process_run
+
+DURATION_S = 15
+DECODER_THREADS = 2  # those of `decode_run_video`
+T = TypeVar("T")
+
+
+@dataclass
+class Taken:
+    """Seconds that something took, each time."""
+
+    wall_s: list[float] = field(default_factory=list)
+    cpu_s: list[float] = field(default_factory=list)
+
+    def time(self, work: Callable[[], T]) -> T:
+        """Do the work, note what it took, and return its result."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = work()
+        self.wall_s.append(time.perf_counter() - wall)
+        self.cpu_s.append(time.process_time() - cpu)
+        return result
+
+    def line(self, name: str, n_frames: int) -> str:
+        """Return medians, whole and a frame."""
+        wall, cpu = statistics.median(self.wall_s), statistics.median(self.cpu_s)
+        return (
+            f"{name:24s} {wall:7.2f} s wall {cpu:7.2f} s CPU   {1e3 * wall / n_frames:6.2f} and "
+            f"{1e3 * cpu / n_frames:6.2f} ms a frame"
+        )
+
+
+def simulated_recording(duration_s: int = DURATION_S) -> tuple[Path, Path, Path]:
+    """Return run folder, calibration and layout of a simulated recording, made now or at an earlier time."""
+    folder = Path(tempfile.gettempdir()) / f"bricktrack-bench-{duration_s}s"
+    found = sorted(folder.glob("runs/*/manifest.json"))
+    if not found or not (folder / "calibration.json").is_file():
+        print(f"recording {duration_s} s with 'bricktrack demo' into {folder} ...", flush=True)
+        command = [sys.executable, "-m", "bricktrack_host.cli", "demo"]
+        done = subprocess.run(
+            [*command, "--folder", str(folder), "--duration", str(duration_s)],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        found = sorted(folder.glob("runs/*/manifest.json"))
+        if done.returncode or not found:
+            raise SystemExit(f"'bricktrack demo' ended with {done.returncode}:\n{done.stderr}")
+    return found[0].parent, folder / "calibration.json", folder / "kit" / "layout.toml"
+
+
+def main() -> None:
+    """Print times, ratios, stages and memory."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--run", type=Path, help="another run, with its calibration and layout")
+    parser.add_argument("--calibration", type=Path)
+    parser.add_argument("--layout", type=Path)
+    parser.add_argument("--repeat", type=int, default=5)
+    options = parser.parse_args()
+    if options.run is None:
+        folder, calibration, layout = simulated_recording()
+    elif options.calibration is None or options.layout is None:
+        parser.error("--run needs --calibration and --layout")
+    else:
+        folder, calibration, layout = options.run, options.calibration, options.layout
+    run = read_run(folder)
+    if run.video is None or run.frames is None:
+        raise SystemExit(f"{folder}: no video with frame times")
+    n = run.frames.n_frames
+    length_s = float(run.frames.sensor_timestamp_ns[-1] - run.frames.sensor_timestamp_ns[0]) / 1e9
+    print(("Simulated recording" if run.manifest.simulated else "Recording") + f" {folder.name}")
+    print(f"{n} frames over {length_s:.1f} s{_mode(run)}; {os.cpu_count()} processors\n")
+    before_mb = _peak_mb()
+    video, decode, process = run.video, Taken(), Taken()
+    stages: list[dict[str, float]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for _ in range(options.repeat):
+            decode.time(lambda: bare_decode(video, DECODER_THREADS))
+            processed = process.time(
+                lambda: process_run(
+                    folder, calibration=calibration, layout=layout, output=Path(scratch) / "results"
+                )
+            )
+            stages.append(processed.result.timings_s)
+    print(decode.line(f"bare decode, {DECODER_THREADS} threads", n))
+    print(process.line("process", n))
+    print("\nprocess / bare decode (median, and range over the repeats)")
+    for name, ours, bare in (
+        ("wall", process.wall_s, decode.wall_s),
+        ("CPU", process.cpu_s, decode.cpu_s),
+    ):
+        ratios = [p / d for p, d in zip(ours, bare, strict=True)]
+        print(f"  {name:5s} {statistics.median(ratios):5.2f}   {min(ratios):.2f} to {max(ratios):.2f}")
+    print(f"process / length of the recording, wall: {statistics.median(process.wall_s) / length_s:.2f}")
+    print("\nstage                    s wall   ms a frame")
+    for name in stages[0]:
+        seconds = statistics.median(s[name] for s in stages)
+        print(f"{name:22s} {seconds:8.2f} {1e3 * seconds / n:12.2f}")
+    print(f"\npeak memory {_peak_mb():.0f} MB, of which {before_mb:.0f} MB are Python and its modules")
+
+
+def _mode(run: Run) -> str:
+    camera = run.manifest.camera
+    return "" if camera is None else f", {camera.mode.width} x {camera.mode.height} px"
+
+
+def _peak_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20) if sys.platform == "darwin" else peak / 1024
+
+
+if __name__ == "__main__":
+    main()
