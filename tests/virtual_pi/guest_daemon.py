@@ -142,15 +142,17 @@ def test_a_sensor_that_fails_in_a_run_leaves_gaps_with_their_errno(unit):
     folder, _ = record(unit, during=break_it)
     _, records, samples = imu_of(folder)
     errors = [r.errno for r in records if r.errno]
+    assert errors.count(121) == 5
+    assert errors.count(110) == 1
     # Every tenth slot reads the status too; a failure that hits that read leaves the slot's sample whole.
-    assert errors.count(121) in (4, 5)
-    assert errors.count(110) <= 1
-    assert all(r.data is None for r in records if r.errno)
+    whole = [r.slot for r in records if r.errno and r.data is not None]
+    assert len(whole) <= 2
+    assert all(slot % 10 == 0 for slot in whole)
     slots = [r.slot for r in records]
     assert slots == sorted(set(slots)), "the grid shifted"
     # Fifteen slots passed while the bus was stuck: they are gaps, and what follows is on the grid again.
-    assert (samples.flags & ImuFlag.GAP != 0).sum() >= 4 + 14
-    assert read_manifest(folder / "manifest.json").quality.imu_gaps >= 4 + 14
+    assert (samples.flags & ImuFlag.GAP != 0).sum() >= 3 + 14
+    assert read_manifest(folder / "manifest.json").quality.imu_gaps >= 3 + 14
 
 
 def test_a_silent_reset_is_flagged_and_not_believed(unit):
