@@ -1,0 +1,73 @@
+"""The whole path-traced sample, made by none of our code: a profile fitted on one video, used on another."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bricktrack_common.brick_model import load_brick_model
+from bricktrack_host.cli import calibrate
+from bricktrack_host.cli.calibrate_leds import leds
+from bricktrack_host.pipeline import process_run
+from bricktrack_host.recordings.import_recording import Recording, import_recording
+from bricktrack_host.recordings.loose_files import read_rig
+
+SAMPLES = os.environ.get("BRICKTRACK_SAMPLES")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(SAMPLES is None, reason="BRICKTRACK_SAMPLES does not name the samples' folder"),
+]
+
+
+@pytest.fixture(scope="module")
+def processed(tmp_path_factory):
+    sample = Path(SAMPLES or "") / "path-traced"
+    folder = tmp_path_factory.mktemp("sample")
+    for name, imus, edges in (
+        ("static", {}, None),
+        ("motion", {"brick": sample / "imu_motion.csv"}, sample / "edges_motion.csv"),
+    ):
+        import_recording(
+            Recording(
+                video=sample / f"{name}.h264",
+                timestamps=sample / f"{name}_pts_us.txt",
+                imus=imus,
+                edges=edges,
+                rig=read_rig(sample / "rig.toml", table=name),
+                unit="sample",
+                label=name,
+                simulated=True,
+            ),
+            folder,
+        )
+    calibration, layout = folder / "calibration.json", folder / "layout.toml"
+    calibrate.fit(calibration, "sample", rig=sample / "rig.toml", target="32x18", images_dir=sample)
+    leds(folder / "sample_static", calibration, sample / "layout.toml", layout)
+    return layout, process_run(
+        folder / "sample_motion",
+        calibration=calibration,
+        layout=layout,
+        truth=sample / "truth" / "motion_dense.csv",
+    )
+
+
+def test_the_fitted_collar_is_near_the_drawn_one(processed):
+    profile = load_brick_model(processed[0]).led_profile
+    assert profile is not None
+    assert profile.collar_mm == pytest.approx(0.7, abs=0.1)  # the README's; limb and lens shift it somewhat
+    assert "simulated" in profile.source
+
+
+def test_every_frame_has_a_pose(processed):
+    # 68 of 75 frames show all seven LEDs, the others six (truth/motion_leds.csv)
+    assert np.isfinite(processed[1].result.optical.t_camera_brick_mm).all()
+
+
+def test_errors_are_below_what_plain_centroids_reach(processed):
+    # "motion, 50 ms about the impact left out, + collar, rows": 0.017 / 0.006 / 0.142 mm and 0.12 deg (README)
+    groups = {(g.source, g.group): g.rms for g in processed[1].truth.groups if g.n}
+    for group in (("optical", "at frames"), ("fused", "at frames"), ("fused", "between frames")):
+        x, y, z, *rotation = groups[group]
+        assert x < 0.017 and y < 0.006 and z < 0.142
+        assert np.linalg.norm(rotation) < 0.12
