@@ -258,8 +258,8 @@ def _set_axis_map(bus: I2cBus, address: int, axis_map: AxisMap) -> None:
     now = bus.read_burst(address, REG_AXIS_MAP, 2)
     if now != wanted:
         raise HardwareError(
-            f"IMU at I2C address 0x{address:02X}: axis map reads {now.hex()} after {wanted.hex()} ({axis_map}) "
-            "was written. Check its supply, then run 'bricktrackd check'"
+            f"IMU at I2C address 0x{address:02X}: axis map reads {now.hex()} after {wanted.hex()} "
+            f"({axis_map}) was written. Check its supply, then run 'bricktrackd check'"
         )
 
 

@@ -11,7 +11,7 @@ from statistics import median
 from bricktrack_common.run_manifest import WaveSection
 
 IN_STEP = 0.1
-"""Of a period: an edge so near to its place is where it should be; further, up to `OUT_OF_STEP`, it is late."""
+"""Of a period: an edge so near to its place is where it should be; further off, up to `OUT_OF_STEP`, late."""
 OUT_OF_STEP = 0.3
 MIN_EDGES = 10
 """So many make a wave; fewer may be a few pulses, and are not judged unless a frequency is configured."""
@@ -48,23 +48,22 @@ def judge_edges(
     if not edges_ns or period_ns is None or (nominal_hz is None and len(edges_ns) < MIN_EDGES):
         last = edges_ns[-1] if edges_ns else None
         return WaveSection(last_edge_ns=last, rejected_ns=rejected), words
-    n_missed = n_extra = n_late = n_steps = 0
     t0 = last_ns = edges_ns[0]
-    last_taken = 0
+    n_steps = 0
+    taken, late_places, n_extra = {0}, set[int](), 0
     for t_ns in edges_ns[1:]:
         steps = (t_ns - last_ns) / period_ns
         k = round(steps)
-        place = n_steps + k
-        off = abs(steps - k)
-        if k < 1 or off > OUT_OF_STEP or place <= last_taken:
+        if k >= 1 and abs(steps - k) <= IN_STEP:
+            n_steps, last_ns = n_steps + k, t_ns
+            taken.add(n_steps)
+        elif k >= 1 and IN_STEP < steps - k <= OUT_OF_STEP and n_steps + k not in late_places:
+            late_places.add(n_steps + k)  # an interrupt may be late, never early
+        else:
             n_extra += 1
-            continue
-        n_missed += place - last_taken - 1
-        last_taken = place
-        if off > IN_STEP:
-            n_late += 1  # it does not say where the wave is, but it was one of its edges
-            continue
-        n_steps, last_ns = place, t_ns
+    n_late = len(late_places - taken)
+    n_extra += len(late_places & taken)  # the edge itself came too
+    n_missed = max(taken | late_places) + 1 - len(taken | late_places)
     hz = n_steps * 1e9 / (last_ns - t0) if n_steps else None
     n_after = max(0, int((end_ns - edges_ns[-1]) / period_ns + IN_STEP) - 1) if end_ns > edges_ns[-1] else 0
     wave = WaveSection(

@@ -1,12 +1,12 @@
 """Which rising edge is t = 0: the first of a wave, and not a lone glitch before it.
 
-Without a known period the first edge has to be believed. With one, an edge is a candidate until those after it
-come in step: two of the next three periods must bring one. A wave that runs steadily at another frequency than
-the configured one is believed too, because a run lost is worse than a run with a warning; `edge_report` tells
-the difference.
+Without a known period the first edge has to be believed. With one, an edge is a candidate until those after
+it come in step: two of the next three periods must bring one. A wave that runs steadily at another frequency
+than the configured one is believed too, because a run lost is worse than a run with a warning; `edge_report`
+tells the difference.
 
-What this cannot tell: a glitch just one period before the wave is an edge in step. The host finds such a slip by
-comparing the edge trains of all units.
+What this cannot tell: a glitch just one period before the wave is an edge in step. The host finds such a slip
+by comparing the edge trains of all units.
 """
 
 from collections import deque

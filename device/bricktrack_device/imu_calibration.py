@@ -1,7 +1,7 @@
-"""Calibrations of BNO055 chips, kept by chip and mode, so that a fusion mode need not learn them at every start.
+"""Calibrations of BNO055 chips, kept by chip and mode: a fusion mode need not learn them at every start.
 
-``<storage>/calibration/<chip id>.json`` holds, for each mode, the 22 bytes of registers 0x55..0x6A as the chip
-had them when it called itself calibrated.
+``<storage>/calibration/<chip id>.json`` holds, for each mode, the 22 bytes of registers 0x55..0x6A as the
+chip had them when it called itself calibrated.
 """
 
 import logging
@@ -38,7 +38,7 @@ class _CalibrationFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 def load_calibration(folder: Path, chip_id: str, mode: ImuMode) -> bytes | None:
-    """Return what was saved for a chip in a mode, or `None`; a file that cannot be read is said in the log."""
+    """Return what was saved for a chip in a mode, or `None`; the log tells of a file that cannot be read."""
     path = _path_of(folder, chip_id)
     if path is None or not path.exists():
         return None

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from bricktrack_common.clocks import check_monotonic_is_boottime, monotonic_ns, read_clock_triplet
 from bricktrack_common.errors import BricktrackError, StorageError
@@ -28,8 +27,10 @@ from bricktrack_device.config import DeviceConfig
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.recording import Recording, save
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.run_store import RunStore, RunWriter
-from bricktrack_device.session import RING_SLACK_S, Session
+from bricktrack_device.room import check_room, disk_needed_bytes
+from bricktrack_device.run_store import RunStore
+from bricktrack_device.run_writer import RunWriter
+from bricktrack_device.session import Session
 from bricktrack_device.state_table import Cause, StateMachine
 
 logger = logging.getLogger(__name__)
@@ -39,7 +40,6 @@ Answer = Callable[[Reply], None]
 _TICK_S = 0.02
 _IDLE_TICK_S = 0.2
 _RETRY_S = 10.0
-_MEMINFO = Path("/proc/meminfo")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class Recorder:
             edges=trigger.n_edges if trigger else 0,
             line_is_high=trigger.line_is_high if trigger else None,
             last_error=self._last_error,
-            disk_needed_bytes=self._disk_needed_bytes(None),
+            disk_needed_bytes=disk_needed_bytes(self._config),
         )
 
     # The thread
@@ -237,7 +237,7 @@ class Recorder:
         try:
             duration_s = duration_s or self._config.recording.duration_s
             check_monotonic_is_boottime(read_clock_triplet())
-            self._check_space(duration_s)
+            check_room(self._config, self._store, duration_s)
             session = Session(
                 self._config,
                 self._rig,
@@ -287,27 +287,6 @@ class Recorder:
         }
         words = remedies.get(self.state, "nothing to do")
         raise RequestRefusedError("wrong-state", f"the unit is {self.state}{of_run}: {words}")
-
-    def _disk_needed_bytes(self, duration_s: float | None) -> int:
-        return 2 * self._config.video_bytes(duration_s) + self._config.storage.margin_mb * 1_000_000
-
-    def _check_space(self, duration_s: float) -> None:
-        needed, free = self._disk_needed_bytes(duration_s), self._store.free_bytes()
-        if free < needed:
-            raise RequestRefusedError(
-                "no-space",
-                f"{free / 1e6:.0f} MB are free in {self._store.folder}; a run of {duration_s:g} s needs "
-                f"{needed / 1e6:.0f} MB (twice its video and a margin). Make room there",
-            )
-        held = self._config.video_bytes(duration_s + RING_SLACK_S)
-        available = _memory_available_bytes()
-        if available is not None and available < 1.3 * held:
-            raise RequestRefusedError(
-                "not-ready",
-                f"{available / 1e6:.0f} MB of memory are available; a run of {duration_s:g} s at "
-                f"{self._config.camera.bitrate_bps / 1e6:g} Mbit/s needs {1.3 * held / 1e6:.0f} MB. Record "
-                "for a shorter time or lower camera.bitrate_bps",
-            )
 
     # Ending a run
 
@@ -417,14 +396,3 @@ class Recorder:
         if words != self._last_error:
             logger.warning("%s", words)
         self._last_error = words[:2000]
-
-
-def _memory_available_bytes() -> int | None:
-    """Return what the kernel says can be had without swapping, or `None` where it does not say."""
-    try:
-        for line in _MEMINFO.read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except (OSError, ValueError):
-        return None
-    return None

@@ -36,7 +36,7 @@ from bricktrack_common.run_manifest import (
     WaveSection,
 )
 from bricktrack_device.ring import VideoCut
-from bricktrack_device.run_store import RunWriter
+from bricktrack_device.run_writer import RunWriter
 from bricktrack_device.trigger import EdgeTrain
 
 _PACKAGES = (

@@ -15,11 +15,10 @@ import fcntl
 import logging
 import os
 import re
-import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import TextIO
 
 import msgspec
 
@@ -28,7 +27,6 @@ from bricktrack_common.errors import RunFormatError, StorageError
 from bricktrack_common.run_manifest import (
     FILE_NAME_PATTERN,
     MANIFEST_NAME,
-    FileEntry,
     RunManifest,
     file_entry,
     is_run_id,
@@ -36,12 +34,12 @@ from bricktrack_common.run_manifest import (
 )
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_common.wire_messages import ErrorCode, FileSummary, RunDescription, RunSummary
+from bricktrack_device.disk import Disk, storage_error
 from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.run_writer import DRAFT_NAME, PARTIAL_SUFFIX, RunWriter
 
 logger = logging.getLogger(__name__)
 
-PARTIAL_SUFFIX = ".partial"
-DRAFT_NAME = "draft.json"
 _COUNTER_IN_ID = re.compile(r"_[0-9a-f]{6}_(\d{4,})(?:_|$)")
 _MAX_LISTED = 10_000
 
@@ -53,44 +51,6 @@ class _Counter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class _Confirmation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     run_id: str
     sha256: list[str]
-
-
-class Disk:
-    """The few file operations that make a write survive a power cut; replaced in tests that cut it."""
-
-    def make_folder(self, folder: Path) -> None:
-        """Make a folder that must not exist, durably."""
-        folder.mkdir()
-        self.sync_folder(folder.parent)
-
-    def write_file(self, path: Path, fill: Callable[[BinaryIO], object]) -> None:
-        """Write a file with ``fill`` and make its contents durable."""
-        with path.open("wb") as file:
-            fill(file)
-            file.flush()
-            os.fsync(file.fileno())
-
-    def sync_file(self, path: Path) -> None:
-        """Make the contents of a file that others wrote durable."""
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-
-    def sync_folder(self, folder: Path) -> None:
-        """Make the names in a folder durable."""
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-    def rename(self, old: Path, new: Path) -> None:
-        """Give a file or folder its final name, durably."""
-        old.rename(new)
-        self.sync_folder(new.parent)
-
-    def free_bytes(self, folder: Path) -> int:
-        """Return how much an ordinary user may still write."""
-        return shutil.disk_usage(folder).free
 
 
 class RunStore:
@@ -182,16 +142,16 @@ class RunStore:
             self._disk.write_file(temporary, lambda f: f.write(dump_json(_Counter(next_run=number + 1))))
             self._disk.rename(temporary, path)
         except OSError as e:
-            raise _storage_error(f"{path}: the run counter cannot be written", e) from e
+            raise storage_error(f"{path}: the run counter cannot be written", e) from e
         return f"{self.unit}_{self._boot}_{number:04d}" + (f"_{label}" if label else "")
 
     def free_bytes(self) -> int:
         """Return the free space."""
         return self._disk.free_bytes(self.folder)
 
-    def open_writer(self, run_id: str) -> "RunWriter":
+    def open_writer(self, run_id: str) -> RunWriter:
         """Return what writes one run."""
-        return RunWriter(self, run_id, self._disk)
+        return RunWriter(self.runs, run_id, self._disk)
 
     # After a power cut
 
@@ -333,7 +293,7 @@ class RunStore:
         try:
             return [p for p in self.runs.iterdir() if is_run_id(p.name) and p.suffix != PARTIAL_SUFFIX]
         except OSError as e:
-            raise _storage_error(f"{self.runs}: cannot be listed", e) from e
+            raise storage_error(f"{self.runs}: cannot be listed", e) from e
 
     def _manifest(self, run_id: str) -> tuple[RunManifest, FileSummary]:
         """Return a run's manifest and the manifest file's own summary; both never change again."""
@@ -354,83 +314,6 @@ class RunStore:
             summary = FileSummary(name=MANIFEST_NAME, n_bytes=len(data), sha256=sha256_bytes(data))
             self._manifests[run_id] = (manifest, summary)
             return manifest, summary
-
-
-class RunWriter:
-    """Writes one run, file after file; after a failure it can be taken up again where it stopped."""
-
-    def __init__(self, store: RunStore, run_id: str, disk: Disk) -> None:
-        self._disk = disk
-        self._final = store.runs / run_id
-        self.folder = store.runs / (run_id + PARTIAL_SUFFIX)
-        self._entries: dict[str, FileEntry] = {}
-        self._others_wrote = False
-        self._is_renamed = False
-
-    def begin(self, draft: RunManifest) -> None:
-        """Make the folder and write down what is known already, for a recovery.
-
-        Raises
-        ------
-        StorageError
-            If that fails; so do all that follow.
-        """
-        if self._is_renamed:
-            return
-        try:
-            if not self.folder.is_dir():
-                self._disk.make_folder(self.folder)
-            self._disk.write_file(self.folder / DRAFT_NAME, lambda f: f.write(dump_json(draft)))
-        except OSError as e:
-            raise _storage_error(f"{self.folder}: cannot be begun", e) from e
-
-    def write(self, name: str, fill: Callable[[BinaryIO], object]) -> None:
-        """Write one file with ``fill``, durably; does nothing if it was written before."""
-        if name in self._entries:
-            return
-        path = self.folder / name
-        try:
-            self._disk.write_file(path, fill)
-            self._entries[name] = file_entry(path)
-        except OSError as e:
-            raise _storage_error(f"{path}: cannot be written", e) from e
-
-    def write_by_others(self, write_into: Callable[[Path], Path | None]) -> None:
-        """Let others write one file of their own into the folder, and take it in; does nothing twice."""
-        if self._others_wrote:
-            return
-        try:
-            path = write_into(self.folder)
-            if path is not None:
-                self._disk.sync_file(path)
-                self._entries[path.name] = file_entry(path)
-        except OSError as e:
-            raise _storage_error(f"{self.folder}: the true motion cannot be written", e) from e
-        self._others_wrote = True
-
-    def finish(self, manifest: RunManifest) -> Path:
-        """Write the manifest with the files' hashes, give the folder its name and return it."""
-        manifest = msgspec.structs.replace(manifest, files=list(self._entries.values()))
-        path = self.folder / MANIFEST_NAME
-        try:
-            if self._is_renamed:
-                self._disk.sync_folder(self._final.parent)
-                return self._final
-            self._disk.write_file(path, lambda f: f.write(dump_json(manifest)))
-            (self.folder / DRAFT_NAME).unlink(missing_ok=True)
-            self._disk.sync_folder(self.folder)
-            self._disk.rename(self.folder, self._final)
-        except OSError as e:
-            self._is_renamed = self._final.is_dir()
-            raise _storage_error(f"{path}: the run cannot be finished", e) from e
-        return self._final
-
-
-def _storage_error(what: str, error: OSError) -> StorageError:
-    remedy = ". Make room on the card" if error.errno == errno.ENOSPC else ""
-    storage_error = StorageError(f"{what}: {error.strerror or error}{remedy}")
-    storage_error.errno = error.errno
-    return storage_error
 
 
 def _counter_of(name: str) -> int:

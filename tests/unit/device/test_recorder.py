@@ -22,8 +22,9 @@ from bricktrack_device.config import (
     StorageTable,
     UnitTable,
 )
+from bricktrack_device.disk import Disk
 from bricktrack_device.recorder import Recorder
-from bricktrack_device.run_store import Disk, RunStore
+from bricktrack_device.run_store import RunStore
 from bricktrack_device.session import Session
 
 
