@@ -213,8 +213,9 @@ def _prepare(item: FusionInput) -> Run:
             "expected one dimension of int64 ns"
         )
     alignment = item.alignment or align_times(item.optical, item.imu)
+    imu = item.imu if alignment.sample_clock is None else alignment.sample_clock.restamp(item.imu)
     return Run.from_tracks(
-        item.optical, item.imu, alignment, lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns
+        item.optical, imu, alignment, lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns
     )
 
 

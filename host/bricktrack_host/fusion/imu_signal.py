@@ -55,7 +55,8 @@ def seconds_since(t_ns: IntArray, epoch_ns: int) -> FloatArray:
     return np.asarray((t_ns - epoch_ns) * 1e-9, dtype=np.float64)
 
 
-def _usable(imu: ImuTrack) -> BoolArray:
+def usable_samples(imu: ImuTrack) -> BoolArray:
+    """Return which samples are whole and new."""
     bad = UNUSABLE | ImuFlag.REPEAT  # a repeat is an old measurement under a new stamp
     whole = np.isfinite(imu.acc_mps2).all(axis=1) & np.isfinite(imu.gyro_radps).all(axis=1)
     return np.asarray(whole & ((imu.flags & int(bad)) == 0))
@@ -159,7 +160,7 @@ class ImuSignal:
         """
         as_float_array("acc_mps2", imu.acc_mps2, (len(imu.t_ns), 3))
         as_float_array("gyro_radps", imu.gyro_radps, (len(imu.t_ns), 3))
-        use = _usable(imu)
+        use = usable_samples(imu)
         if use.sum() < MIN_SAMPLES:
             raise ShapeError(
                 f"only {use.sum()} of {use.size} inertial samples are whole; at least {MIN_SAMPLES} are "

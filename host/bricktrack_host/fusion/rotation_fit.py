@@ -17,11 +17,16 @@ GRID_S = 0.004  # of the cross-correlation
 _NODE_S = 0.0025  # of the integrated gyro
 _KNOT_S = 0.5  # of the slow drift between integrated gyro and optics: its noise, bias and scale error
 _AMBIGUOUS_SIGMA = 5.0
+_MISFIT_CAP = 25.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """One least-squares fit: offset and skew with covariance, gyro bias, and how well the attitudes agree."""
+    """One least-squares fit: offset and skew with covariance, gyro bias, and how well the attitudes agree.
+
+    ``misfit`` is the sum of squares behind ``residual_sd``, in which no frame counts more than `_MISFIT_CAP`
+    times what it should.
+    """
 
     offset_s: float
     skew: float
@@ -29,6 +34,7 @@ class Fit:
     bias_sd_radps: FloatArray
     covariance: FloatArray
     residual_sd: float
+    misfit: float
     n_frames: int
 
     @property
@@ -207,7 +213,8 @@ class RotationFit:
             elif abs(step[0]) < 1e-7 and iteration > 3:
                 break
         bias, bias_covariance = self._bias(t, attitude, drift, sd * self._sd[inside])
-        return Fit(offset, skew, self._gyro_bias + bias, np.sqrt(np.diag(bias_covariance)), covariance, sd, n)
+        misfit = 3 * float(np.minimum(residual**2, _MISFIT_CAP * sd**2).sum())
+        return Fit(offset, skew, self._gyro_bias + bias, np.sqrt(np.diag(bias_covariance)), covariance, sd, misfit, n)
 
     @staticmethod
     def _bias(

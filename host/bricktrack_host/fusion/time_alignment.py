@@ -5,7 +5,7 @@ Convention (DESIGN 8.2): a frame stamped ``t_o`` by the camera lies at IMU time
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_a
 from bricktrack_common.errors import ConfigError, TrackingError
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.fusion.rotation_fit import GRID_S, MIN_POSES, Fit, RotationFit, as_likely, correlate
+from bricktrack_host.fusion.sample_clock import RATE_SD, SampleClock, find_sample_clock
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 logger = logging.getLogger(__name__)
@@ -49,6 +50,9 @@ class TimeAlignment:
         The motion says an offset that the stamps' prior does not allow (beyond four sd).
     reason : str
         Why it is not trusted, or how it disagrees; empty when all is well.
+    sample_clock : SampleClock or None
+        When the sensor truly took its samples, where the stamps of its reads do not say. The IMU time above
+        is then that of the samples.
     """
 
     offset_ns: float
@@ -64,6 +68,7 @@ class TimeAlignment:
     is_trusted: bool
     disagrees_with_stamps: bool
     reason: str
+    sample_clock: SampleClock | None = None
 
     def imu_time_ns(self, t_ns: IntArray) -> IntArray:
         """Return the IMU's time of instants given in camera time."""
@@ -94,12 +99,14 @@ def align_times(
     prior_sd_ns: float = 5e6,
     skew_prior_sd: float = 1e-4,
     max_sd_ns: float = 1e6,
+    _is_restamped: bool = False,
 ) -> TimeAlignment:
     """Return how camera time maps to IMU time, from the rotations that both saw.
 
     Coarse by correlation of angular rates, then by robust least squares of the optical attitudes against
     the integrated gyro. A motion with too little rotation, or one so periodic that several offsets fit,
-    gives back the stamps' prior and says why.
+    gives back the stamps' prior and says why. A sensor whose own clock beats with the reads has its samples
+    put in their place first (`sample_clock`).
 
     Parameters
     ----------
@@ -176,6 +183,22 @@ def align_times(
         return from_stamps("no offset within reach lets the angular rates agree")
     fits.sort(key=lambda fit: fit.residual_sd)
     best = fits[0]
+    own = None
+    if not _is_restamped:
+        own = find_sample_clock(t_s, R, sd_rad, signal, imu, offset_s=best.offset_s)
+    if own is not None:
+        found = align_times(
+            optical,
+            own.restamp(imu),
+            max_offset_s=max_offset_s,
+            prior_offset_ns=prior_offset_ns,
+            prior_sd_ns=prior_sd_ns,
+            skew_prior_sd=max(skew_prior_sd, RATE_SD),
+            max_sd_ns=max_sd_ns,
+            _is_restamped=True,
+        )
+        if found.source == "data":
+            return replace(found, sample_clock=own)
     speed, vector = correlation.at(best.offset_s)
     if vector < _MIN_VECTOR_CORRELATION and np.nanmax(correlation.speed) > _CLEAR_SPEED_CORRELATION:
         return from_stamps(
