@@ -116,9 +116,10 @@ class ImuTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ``mode`` is "amg" (raw, ±16 g, the choice for shakes with impacts), "accgyro" (raw without
     magnetometer), "imuplus" or "ndof" (the chip's own orientation; ±4 g). ``latency_us`` is added to the
     middle of the bus transaction to give the sample time: negative for a filter's lag. ``axis_map`` is the
-    placement whose remap the chip applies (data sheet, section 3.4; "P1" turns nothing). In the fusion modes a
-    calibration saved for this chip is written into it at every start, and with ``save_calibration = true``
-    it is saved after a run, or at disarming, whenever the chip says that it is fully calibrated. With
+    placement whose remap the chip applies (data sheet, section 3.4; "P1" turns nothing). In the fusion modes
+    a calibration saved for this chip is written into it at every start, and with
+    ``save_calibration = true`` it is saved after a run, or at disarming, whenever the chip says that it is
+    fully calibrated. With
     ``required = true`` a unit whose sensor does not start refuses to arm.
     """
 

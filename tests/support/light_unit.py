@@ -12,6 +12,7 @@ from pathlib import Path
 
 from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 
+from bricktrack_common.clocks import monotonic_ns
 from bricktrack_device.config import (
     DeviceConfig,
     ImuTable,
@@ -23,9 +24,11 @@ from bricktrack_device.config import (
     UnitTable,
 )
 from bricktrack_device.daemon import Daemon
+from bricktrack_device.sim.sim_pins import make_factory
 
 PICTURE_BYTES = 50_000  # 12 Mbit/s at 30 pictures a second
 DURATION_S = 0.5
+WAVE_HZ = 100.0
 
 
 def light_config(storage: Path) -> DeviceConfig:
@@ -34,7 +37,7 @@ def light_config(storage: Path) -> DeviceConfig:
         unit=UnitTable(name="light"),
         storage=StorageTable(folder=str(storage), margin_mb=1),
         server=ServerTable(port=0),
-        trigger=TriggerTable(nominal_hz=100.0),
+        trigger=TriggerTable(nominal_hz=WAVE_HZ),
         recording=RecordingTable(
             duration_s=DURATION_S, pre_roll_s=0.1, post_roll_s=0.1, auto_arm=True, label="light"
         ),
@@ -48,14 +51,19 @@ class SelfDrivenRig(FakeRig):
 
     def __init__(self) -> None:
         super().__init__(camera=FakeCamera(n_bytes=PICTURE_BYTES), buses={"a": FakeBusOpener(fail_every=40)})
+        self.factory = make_factory()
 
     def on_armed(self, t_armed_ns: int) -> None:
         super().on_armed(t_armed_ns)
-        threading.Thread(target=self._drive, daemon=True).start()
+        threading.Thread(target=self._drive, args=(t_armed_ns + 100_000_000,), daemon=True).start()
 
-    def _drive(self) -> None:
-        time.sleep(0.1)
-        self.pulse(round(1.5 * DURATION_S * 100), half_period_s=0.005)
+    def _drive(self, first_ns: int) -> None:
+        """Drive the line on a grid; as in a kernel, the stamps are right however late this thread is."""
+        pin = self.factory.pin("GPIO17")
+        for k in range(round(1.5 * DURATION_S * 2 * WAVE_HZ)):
+            t_ns = first_ns + round(k * 0.5e9 / WAVE_HZ)
+            time.sleep(max(0.0, (t_ns - monotonic_ns()) * 1e-9))
+            pin.drive_at(k % 2 == 0, t_ns * 1e-9)
 
 
 if __name__ == "__main__":

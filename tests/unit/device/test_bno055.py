@@ -2,6 +2,7 @@ import pytest
 from device_fakes import FakeBus
 
 from bricktrack_common.errors import HardwareError
+from bricktrack_common.imu_records import AxisMap
 from bricktrack_device import bno055
 from bricktrack_device.config import ImuMode
 
@@ -96,3 +97,89 @@ def test_a_chip_that_is_slow_to_wake_is_tried_again() -> None:
     waits: list[float] = []
     facts = bno055.set_up(Sleepy(), 0x28, "amg", sleep=waits.append)
     assert facts.opr_mode == 0x07 and waits[0] >= 0.3
+
+
+# Table 3-4 of the data sheet: AXIS_MAP_CONFIG and AXIS_MAP_SIGN of each placement.
+@pytest.mark.parametrize(
+    ("axis_map", "registers"),
+    [
+        ("P0", "2104"), ("P1", "2400"), ("P2", "2406"), ("P3", "2102"),
+        ("P4", "2403"), ("P5", "2101"), ("P6", "2107"), ("P7", "2405"),
+    ],
+)  # fmt: skip
+def test_each_placement_is_written_and_read_back(axis_map: AxisMap, registers: str) -> None:
+    bus = FakeBus()
+    facts = bno055.set_up(bus, 0x28, "amg", axis_map=axis_map, sleep=no_sleep)
+    assert bus.pages[0][0x41:0x43].hex() == registers and facts.axis_map == axis_map
+
+
+def test_an_axis_map_that_the_chip_refuses_is_an_error() -> None:
+    class Stubborn(FakeBus):
+        def _write(self, register: int, value: int) -> None:
+            if register != 0x41:
+                super()._write(register, value)
+
+    with pytest.raises(HardwareError, match=r"axis map reads 2401 after 2101 \(P5\)"):
+        bno055.set_up(Stubborn(), 0x28, "amg", axis_map="P5", sleep=no_sleep)
+
+
+class ConfigOnly(FakeBus):
+    """A chip that takes and shows offsets only in CONFIG mode, as the real one does."""
+
+    def __post_init__(self) -> None:
+        self.bursts: list[tuple[int, int]] = []
+        super().__post_init__()
+
+    def writeto(self, address: int, buffer: bytes, *, start: int = 0, end: int | None = None) -> None:
+        data = bytes(buffer)[start:end]
+        if data and 0x55 <= data[0] <= 0x6A:
+            self.bursts.append((data[0], len(data) - 1))
+            if self.pages[0][0x3D] != 0:
+                return
+        super().writeto(address, buffer, start=start, end=end)
+
+    def read_burst(self, address: int, register: int, n_bytes: int) -> bytes:
+        data = super().read_burst(address, register, n_bytes)
+        return bytes(n_bytes) if register == 0x55 and self.pages[0][0x3D] != 0 else data
+
+
+SAVED = bytes(range(100, 122))
+
+
+@pytest.mark.parametrize("mode", ["imuplus", "ndof"])
+def test_a_saved_calibration_is_written_in_one_burst_before_fusion_starts(mode: ImuMode) -> None:
+    bus, asked = ConfigOnly(), []
+
+    def saved(chip_id: str) -> bytes:
+        asked.append(chip_id)
+        return SAVED
+
+    facts = bno055.set_up(bus, 0x28, mode, saved_calibration=saved, sleep=no_sleep)
+    assert asked == [facts.chip_id] and facts.calibration_restored
+    assert bus.bursts == [(0x55, 22)] and bytes(bus.pages[0][0x55:0x6B]) == SAVED
+
+
+def test_raw_modes_and_unknown_chips_get_no_calibration() -> None:
+    bus = ConfigOnly()
+    assert not bno055.set_up(
+        bus, 0x28, "amg", saved_calibration=lambda chip_id: SAVED, sleep=no_sleep
+    ).calibration_restored
+    assert not bno055.set_up(bus, 0x28, "ndof", sleep=no_sleep).calibration_restored and bus.bursts == []
+
+
+def test_a_calibration_is_read_in_config_mode_and_the_mode_comes_back() -> None:
+    bus = ConfigOnly()
+    bno055.set_up(bus, 0x28, "ndof", saved_calibration=lambda chip_id: SAVED, sleep=no_sleep)
+    bus.pages[0][0x35] = 0xFF
+    waits: list[float] = []
+    assert bno055.read_calibration(bus, 0x28, 0x0C, sleep=waits.append) == (SAVED, 0xFF)
+    assert bus.pages[0][0x3D] == 0x0C and min(waits) >= 0.019
+
+
+@pytest.mark.parametrize(
+    ("opr_mode", "calib_stat", "expected"),
+    # System, gyroscope, accelerometer, magnetometer: two bits each; IMUPLUS has no magnetometer, and says 0.
+    [(0x0C, 0xFF, True), (0x0C, 0xFC, False), (0x08, 0x3C, True), (0x08, 0x2C, False), (0x07, 0xFF, False)],
+)
+def test_calibrated_means_all_that_the_mode_uses(opr_mode: int, calib_stat: int, expected: bool) -> None:
+    assert bno055.is_calibrated(opr_mode, calib_stat) is expected

@@ -25,13 +25,11 @@ def poll_until(reader: ImuReader, condition: Callable[[], bool], timeout_s: floa
         time.sleep(0.005)
 
 
-def shared_memory_names() -> set[str]:
-    return {p.name for p in Path("/dev/shm").glob("psm_*")}
-
-
 def test_samples_of_a_window_come_on_the_grid() -> None:
-    before = shared_memory_names()
     reader = reader_on(FakeBusOpener(fail_every=10))
+    assert reader._buffer is not None
+    memory = Path("/dev/shm") / reader._buffer.name
+    assert memory.exists()
     reader.start()
     try:
         poll_until(reader, lambda: reader.is_ready)
@@ -51,7 +49,7 @@ def test_samples_of_a_window_come_on_the_grid() -> None:
     finally:
         reader.stop()
         reader.stop()
-    assert shared_memory_names() <= before
+    assert not memory.exists()
     assert reader.status().samples == 0
 
 
@@ -97,3 +95,29 @@ def test_a_set_up_that_never_ends_is_given_up(monkeypatch: pytest.MonkeyPatch) -
         assert "not set up within" in reader.problem
     finally:
         reader.stop()
+
+
+def test_what_a_sensor_learnt_is_kept_when_it_ends_and_restored_when_it_starts(tmp_path: Path) -> None:
+    # The fake's CALIB_STAT is full at once; its offsets are zero until something is written.
+    settings = ImuTable(name="brick", period_ms=5, mode="ndof", save_calibration=True)
+    for was_restored in (False, True):
+        reader = ImuReader(settings, FakeBusOpener(), ORDINARY, span_s=5.0, calibration_folder=tmp_path)
+        reader.start()
+        try:
+            poll_until(reader, lambda reader=reader: reader.is_ready and reader.status().samples > 3)
+            description = reader.description()
+            assert description is not None and description.calibration_restored is was_restored
+        finally:
+            reader.stop()
+        assert [p.stem for p in tmp_path.iterdir()] == [bytes(range(16)).hex()]
+
+
+def test_nothing_is_kept_unless_it_was_asked_for(tmp_path: Path) -> None:
+    settings = ImuTable(name="brick", period_ms=5, mode="ndof")
+    reader = ImuReader(settings, FakeBusOpener(), ORDINARY, span_s=5.0, calibration_folder=tmp_path)
+    reader.start()
+    try:
+        poll_until(reader, lambda: reader.is_ready)
+    finally:
+        reader.stop()
+    assert list(tmp_path.iterdir()) == []

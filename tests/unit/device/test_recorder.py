@@ -14,12 +14,14 @@ from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Armed, Disarmed, Refusal, Reply
 from bricktrack_device import recorder as recorder_module
+from bricktrack_device import session as session_module
 from bricktrack_device.config import (
     CameraTable,
     DeviceConfig,
     ImuTable,
     RecordingTable,
     StorageTable,
+    TriggerTable,
     UnitTable,
 )
 from bricktrack_device.disk import Disk
@@ -298,3 +300,22 @@ def test_a_bug_while_recording_saves_what_there_is_and_ends_in_fault(
     run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
     assert run.manifest.state == "interrupted" and run.frames is not None
     assert isinstance(b.ask("disarm"), Disarmed) and b.recorder.state == "idle"
+
+
+def test_a_line_stuck_high_leaves_the_unit_armed_and_the_status_says_why(
+    bench: Callable[..., Bench],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(session_module, "_STUCK_HIGH_NS", 200_000_000)
+    b = bench(trigger=TriggerTable(pull="none"))  # a mock pin with a pull starts there
+    b.rig.factory.pin("GPIO17").drive_high()
+    b.arm()
+    wait_until(lambda: "the line was high all the time" in caplog.text)
+    assert b.recorder.state == "armed" and "high all the time" in b.recorder.status().reason
+    b.rig.factory.pin("GPIO17").drive_low()
+    b.rig.pulse()
+    b.wait_for("recording")
+    b.wait_for("idle")
+    assert b.recorder.status().reason == ""

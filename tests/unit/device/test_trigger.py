@@ -164,3 +164,52 @@ def test_half_an_hour_of_ticks_in_float_seconds_keeps_nanoseconds() -> None:
 def test_a_pin_that_does_not_exist_is_a_hardware_error_naming_it() -> None:
     with pytest.raises(HardwareError, match="GPIO99"):
         Trigger(MockFactory(), TriggerTable(pin="GPIO99"))
+
+
+def wave(line: Line, start_ns: int, n: int, *, period_ns: int = 20 * MS) -> list[int]:
+    rises = [start_ns + k * period_ns for k in range(n)]
+    for t in rises:
+        line.edge(t, 1)
+        line.edge(t + period_ns // 2, 0)
+    return rises
+
+
+def test_with_a_known_period_a_glitch_before_the_wave_is_kept_apart() -> None:
+    line = Line(nominal_hz=50.0)
+    t = line.arm()
+    line.edge(t + 500 * MS, 1)
+    line.edge(t + 501 * MS, 0)
+    assert line.trigger.t0_ns is None and line.n_first == 0 and line.trigger.n_edges == 0
+    rises = wave(line, t + 777 * MS, 2)
+    assert line.trigger.t0_ns is None  # provisional until a third edge
+    rises += wave(line, t + 817 * MS, 8)
+    train = line.trigger.snapshot()
+    assert train.t0_ns == rises[0] and train.edges_ns == rises and line.n_first == 1
+    assert (train.n_ignored, train.rejected_ns) == (1, [t + 500 * MS])
+
+
+def test_a_minute_at_1_khz_is_logged_without_a_loss() -> None:
+    line = Line(nominal_hz=1000.0)
+    rises = wave(line, line.arm() + 5 * MS, 60_000, period_ns=MS)
+    assert line.trigger.snapshot().edges_ns == rises
+
+
+def test_a_line_that_is_stuck_high_is_said_with_how_long() -> None:
+    line = Line()
+    line.pin.drive_high()
+    t = line.arm()
+    line.now_ns = t + 90_000 * MS
+    words = line.trigger.waiting_words()
+    assert "armed for 90 s and the line was high all the time" in words and "goes low" in words
+
+
+def test_a_line_that_is_stuck_low_stays_armed_and_says_how_long() -> None:
+    line = Line(nominal_hz=50.0)
+    t = line.arm()
+    line.now_ns = t + 3600_000 * MS
+    assert line.trigger.waiting_words() == "armed for 3600 s; the line is low, unchanged for 3600 s"
+    line.edge(t + 3600_000 * MS, 1)
+    line.now_ns += 2000 * MS
+    assert "an edge 2.0 s ago waits for others in step" in line.trigger.waiting_words()
+    wave(line, line.now_ns, 3)
+    assert line.trigger.waiting_words() == ""
