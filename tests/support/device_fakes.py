@@ -107,7 +107,7 @@ class FakeBus:
                 raise OSError(errno.EREMOTEIO, "injected")
             if self.n_bursts == self.reset_after:
                 self._reset()
-            self.pages[0][0x08:0x0A] = (self.n_bursts % 1000).to_bytes(2, "little")
+            self.pages[0][0x08:0x0A] = (1 + self.n_bursts % 1000).to_bytes(2, "little")
         return bytes(self.pages[self.page][register : register + n_bytes])
 
     def close(self) -> None:
