@@ -9,6 +9,7 @@ above `SHARE_HIGH` plateau: an uneven wall behind the LED and the fall of bright
 not pull. Nothing depends on an absolute grey level, hence not on exposure.
 """
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -28,6 +29,7 @@ FLOOR_SD_PX = 0.06
 """Precision of dot centres on real photographs by a Pi camera (DESIGN 7.1): lens, mosaic and codec, which the
 pixels' own noise does not show."""
 _NOISE_CODES = 2.0  # shot, read-out and codec noise at the rim, in grey levels of 8 bits
+_FLOOR_PX2 = FLOOR_SD_PX**2 * np.eye(2)
 _OWN = 128
 _MIN_CONTRAST = 0.02  # of full linear scale; less is noise or compression, not a lamp
 
@@ -39,6 +41,12 @@ def _linear_light() -> FloatArray:
     light: FloatArray = np.where(signal < 0.081, signal / 4.5, ((signal + 0.099) / 1.099) ** (1 / 0.45))
     light.setflags(write=False)
     return light
+
+
+@cache
+def _linear_light_list() -> list[float]:
+    values: list[float] = _linear_light().tolist()
+    return values
 
 
 def linear_light_of_luma() -> FloatArray:
@@ -80,6 +88,34 @@ class Spot:
     touches_window: bool
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundLight:
+    """One light found in a window, not yet measured.
+
+    Attributes
+    ----------
+    mask : ndarray of uint8, shape (rows, columns)
+        Of the window: 128 where the light is, 255 where others are, 0 elsewhere.
+    box : tuple of int
+        Column, row, width, height in the window.
+    n_pixels : int
+    share : ndarray, shape (256,)
+        From luma code to the share of a pixel that the light covers, not yet cut to 0..1.
+    plateau, background : float
+        Linear light, 0..1.
+    touches_window : bool
+        The light goes on beyond the window.
+    """
+
+    mask: Plane
+    box: tuple[int, int, int, int]
+    n_pixels: int
+    share: FloatArray
+    plateau: float
+    background: float
+    touches_window: bool
+
+
 def light_levels(patch: Plane) -> tuple[float, float] | None:
     """Return background and plateau of a window in linear light, or `None` where nothing shines.
 
@@ -87,27 +123,28 @@ def light_levels(patch: Plane) -> tuple[float, float] | None:
     medians of the classes, which neither a reflection nor the rim moves.
     """
     counts = np.bincount(patch[::2, ::2].ravel(), minlength=256).astype(np.float64)
-    light = _linear_light()
-    cum_n = np.cumsum(counts)
-    cum_light = np.cumsum(counts * light)
+    # Lists: single numbers are looked up and reckoned with several times faster than in arrays.
+    light = _linear_light_list()
+    cum_n: list[float] = np.cumsum(counts).tolist()
+    cum_light: list[float] = np.cumsum(counts * _linear_light()).tolist()
     total_n, total_light = cum_n[-1], cum_light[-1]
-    lit = np.flatnonzero(counts)
+    lit = counts.nonzero()[0]
     low, high = light[lit[0]], light[lit[-1]]
     if high - low < _MIN_CONTRAST:
         return None
     threshold = 0.5 * (low + high)
     for _ in range(20):
-        i = int(np.searchsorted(light, threshold, side="right")) - 1
+        i = bisect_right(light, threshold) - 1
         n_below = cum_n[i]
         if n_below <= 0 or n_below >= total_n:
             return None
         new = 0.5 * (cum_light[i] / n_below + (total_light - cum_light[i]) / (total_n - n_below))
         if abs(new - threshold) < 1e-4:
             break
-        threshold = float(new)
+        threshold = new
     n_below = cum_n[i]
-    background = float(light[int(np.searchsorted(cum_n, 0.5 * n_below))])
-    plateau = float(light[int(np.searchsorted(cum_n, n_below + 0.5 * (total_n - n_below)))])
+    background = light[bisect_left(cum_n, 0.5 * n_below)]
+    plateau = light[bisect_left(cum_n, n_below + 0.5 * (total_n - n_below))]
     return (background, plateau) if plateau - background >= _MIN_CONTRAST else None
 
 
@@ -136,21 +173,39 @@ def measure_spot(
     Covariance: each rim pixel's share errs by the noise over the contrast, independently, and lies at about
     the radius; so var = 2 M sum(var_share) / area^2, M the matrix of second moments. `FLOOR_SD_PX` is added.
     """
+    u0, v0 = (
+        near_px
+        if near_px is not None
+        else (origin_px[0] + patch.shape[1] / 2, origin_px[1] + patch.shape[0] / 2)
+    )
+    light = find_light(patch, near_px=(u0 - origin_px[0], v0 - origin_px[1]), levels=levels)
+    return None if light is None else measure_light(patch, light, origin_px=origin_px)
+
+
+def find_light(
+    patch: Plane, *, near_px: tuple[float, float], levels: tuple[float, float] | None = None
+) -> FoundLight | None:
+    """Return the light nearest to a point (column, row) of a window, or `None` where there is none."""
     found = levels if levels is not None else light_levels(patch)
     if found is None:
         return None
     background, plateau = found
-    light = _linear_light()
-    share = (light - background) / (plateau - background)
+    share = (_linear_light() - background) / (plateau - background)
     rows, columns = patch.shape
     cut = int(np.searchsorted(share, SEARCH_SHARE))
     mask = np.asarray(cv2.threshold(patch, max(cut - 1, 0), 255, cv2.THRESH_BINARY)[1], dtype=np.uint8)
-    u0, v0 = near_px if near_px is not None else (origin_px[0] + columns / 2, origin_px[1] + rows / 2)
-    seed = _lit_pixel(mask, u0 - origin_px[0], v0 - origin_px[1])
+    seed = _lit_pixel(mask, near_px[0], near_px[1])
     if seed is None:
         return None
-    _, _, _, (x, y, w, h) = cv2.floodFill(mask, None, seed, _OWN, flags=8)
+    n_pixels, _, _, (x, y, w, h) = cv2.floodFill(mask, None, seed, _OWN, flags=8)
     touches = x == 0 or y == 0 or x + w == columns or y + h == rows
+    return FoundLight(mask, (x, y, w, h), n_pixels, share, plateau, background, touches)
+
+
+def measure_light(patch: Plane, light: FoundLight, *, origin_px: tuple[int, int]) -> Spot | None:
+    """Measure a light found in the same window; `None` where it is less than three pixels of light."""
+    x, y, w, h = light.box
+    share, mask = light.share, light.mask
     # The soft rim reaches beyond the half-light line; three pixels hold it, and more where motion smears it.
     reach = 3 + max(w, h) // 12
     x0, y0 = max(x - reach, 0), max(y - reach, 0)
@@ -158,10 +213,10 @@ def measure_spot(
     mask = mask[box]
     is_own = mask == _OWN
     own = cv2.dilate(is_own.view(np.uint8), _square(reach))
-    others = mask == 255
-    if others.any():
+    if mask.max() == 255:
+        others = mask == 255
         own[(cv2.dilate(others.view(np.uint8), _square(reach)) > 0) & ~is_own] = 0
-    table = np.clip((share - SHARE_LOW) / (SHARE_HIGH - SHARE_LOW), 0.0, 1.0)
+    table = np.minimum(np.maximum((share - SHARE_LOW) / (SHARE_HIGH - SHARE_LOW), 0.0), 1.0)
     weights = cv2.LUT(patch[box], table.astype(np.float32)) * own
     m: dict[str, Any] = cv2.moments(weights)
     area = float(m["m00"])
@@ -179,24 +234,24 @@ def measure_spot(
         noise = float(np.count_nonzero((weights > 0) & (weights < 1))) * float(slope**2)
     else:
         noise = float(w + h)
-    cov = 2.0 * M * (noise / area**2) + FLOOR_SD_PX**2 * np.eye(2)
+    cov = 2.0 * M * (noise / area**2) + _FLOOR_PX2
     return Spot(
         uv_px=uv,
         cov_px2=cov,
         area_px2=area,
         eccentricity=float(np.sqrt(1 - small / large)),
         fill=float(area / (4 * np.pi * np.sqrt(large * small))),
-        plateau=plateau,
-        background=background,
+        plateau=light.plateau,
+        background=light.background,
         bbox=(origin_px[0] + x, origin_px[1] + y, w, h),
-        touches_window=touches,
+        touches_window=light.touches_window,
     )
 
 
 def _lit_pixel(mask: Plane, u: float, v: float) -> tuple[int, int] | None:
     """Return a pixel of the light nearest to a point: of the component, not of a speck beside it."""
     rows, columns = mask.shape
-    i, j = int(np.clip(round(u), 0, columns - 1)), int(np.clip(round(v), 0, rows - 1))
+    i, j = min(max(round(u), 0), columns - 1), min(max(round(v), 0), rows - 1)
     if mask[j, i] and mask[max(j - 1, 0) : j + 2, max(i - 1, 0) : i + 2].all():
         return i, j
     n, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)

@@ -6,6 +6,7 @@ colour and grey limits, rejection by area, radius and eccentricity, plain means.
 """
 
 from dataclasses import dataclass
+from math import ceil, floor, hypot
 
 import cv2
 import numpy as np
@@ -14,7 +15,13 @@ from numpy.typing import NDArray
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import ShapeError
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.centroids import FLOOR_SD_PX, Spot, linear_light_of_luma, measure_spot
+from bricktrack_host.tracking.centroids import (
+    FLOOR_SD_PX,
+    Spot,
+    find_light,
+    linear_light_of_luma,
+    measure_light,
+)
 
 Plane = NDArray[np.uint8]
 
@@ -23,6 +30,7 @@ _LEVELS = (0.55, 0.28, 0.12)
 brightness, and a lamp or a reflection may outshine them."""
 _MAX_CANDIDATES = 40
 _MIN_BOX_SHARE = 0.45
+_MIN_PIXELS = 8  # of a light that a larger window is worth
 _MIN_FILL = 0.90  # a disc behind a straight edge keeps 0.93 and more; rings, arcs and pairs have less
 _MAX_ECCENTRICITY = 0.87  # a hemisphere seen from the side: half a disc, 0.85
 
@@ -163,10 +171,15 @@ def find_candidates(picture: Picture, *, radius_px: float | None = None) -> Cand
 def measure_candidates(picture: Picture, candidates: Candidates) -> Blobs:
     """Measure the lights of a search at full resolution; those that show none are left out."""
     spots: list[Spot] = []
+    places: list[tuple[float, float]] = []
     for uv, half in zip(candidates.uv_px, candidates.half_size_px, strict=True):
         spot = _measure_window(picture.luma, uv, half)
-        if spot is not None and not any(np.hypot(*(s.uv_px - spot.uv_px)) < 2.0 for s in spots):
+        if spot is None:
+            continue
+        u, v = spot.uv_px.tolist()
+        if not any(hypot(u - other[0], v - other[1]) < 2.0 for other in places):
             spots.append(spot)
+            places.append((u, v))
     return _blobs_of(spots, picture.luma.shape)
 
 
@@ -178,29 +191,29 @@ def find_blobs(picture: Picture, *, radius_px: float | None = None) -> Blobs:
 def _measure_window(luma: Plane, uv_px: FloatArray, half_px: FloatArray) -> Spot | None:
     """Measure one light in a window about twice its size, larger where it does not fit."""
     rows, columns = luma.shape
-    margin = 8.0 + 0.35 * half_px
-    spot = None
-    for _ in range(3):
-        low = np.floor(uv_px - half_px - margin).astype(int)
-        high = np.ceil(uv_px + half_px + margin).astype(int) + 1
-        u0, v0 = max(int(low[0]), 0), max(int(low[1]), 0)
-        u1, v1 = min(int(high[0]), columns), min(int(high[1]), rows)
+    (u, v), (half_u, half_v) = uv_px.tolist(), half_px.tolist()
+    margin_u, margin_v = 8.0 + 0.35 * half_u, 8.0 + 0.35 * half_v
+    for may_grow in (True, True, False):
+        u0, v0 = max(floor(u - half_u - margin_u), 0), max(floor(v - half_v - margin_v), 0)
+        u1, v1 = min(ceil(u + half_u + margin_u) + 1, columns), min(ceil(v + half_v + margin_v) + 1, rows)
         if u1 - u0 < 4 or v1 - v0 < 4:
             return None
-        spot = measure_spot(
-            luma[v0:v1, u0:u1], origin_px=(u0, v0), near_px=(float(uv_px[0]), float(uv_px[1]))
-        )
-        inside_a_light = spot is not None and spot.background > 0.6 * spot.plateau
-        if not inside_a_light and (
-            spot is None or not spot.touches_window or _at_border(spot, rows, columns)
-        ):
-            return spot
-        margin = margin * 2
-    return spot
+        patch = luma[v0:v1, u0:u1]
+        light = find_light(patch, near_px=(u - u0, v - v0))
+        if light is None:
+            return None
+        x, y, w, h = light.box
+        at_border = _at_border((u0 + x, v0 + y, w, h), rows, columns)
+        goes_on = light.touches_window and not at_border
+        inside_a_light = light.background > 0.6 * light.plateau
+        if not (may_grow and (goes_on or inside_a_light) and light.n_pixels >= _MIN_PIXELS):
+            return measure_light(patch, light, origin_px=(u0, v0))
+        margin_u, margin_v = margin_u * 2, margin_v * 2
+    return None
 
 
-def _at_border(spot: Spot, rows: int, columns: int) -> bool:
-    x, y, w, h = spot.bbox
+def _at_border(box: tuple[int, int, int, int], rows: int, columns: int) -> bool:
+    x, y, w, h = box
     return x <= 0 or y <= 0 or x + w >= columns or y + h >= rows
 
 
@@ -211,7 +224,7 @@ def _blobs_of(spots: list[Spot], shape: tuple[int, ...]) -> Blobs:
     areas = np.array([s.area_px2 for s in spots])
     fill = np.array([s.fill for s in spots])
     eccentricity = np.array([s.eccentricity for s in spots])
-    flags[[_at_border(s, shape[0], shape[1]) for s in spots]] |= LedFlag.BORDER
+    flags[[_at_border(s.bbox, shape[0], shape[1]) for s in spots]] |= LedFlag.BORDER
     odd = (fill < _MIN_FILL) | (eccentricity > _MAX_ECCENTRICITY)
     good = ~odd & (flags == 0)
     usual = float(np.median(areas[good])) if good.any() else float(np.median(areas))
