@@ -2,8 +2,8 @@
 
 A row is exposed from ``stamp + delay - exposure`` to ``stamp + delay``. Where an LED is switched in between,
 the row has got a share f of the change: ``f = (stamp + delay - t) / exposure``, for on and off alike. So each
-row that shows 0 < f < 1 gives an instant of its own, ``t = stamp + delay - f * exposure``; its difference from
-the GPIO's instant is the error of the recorded time of that row's mid-exposure.
+row that shows 0 < f < 1 gives an instant of its own, ``t = stamp + delay - f * exposure``; its difference
+from the GPIO's instant is the error of the recorded time of that row's mid-exposure.
 """
 
 from collections.abc import Sequence

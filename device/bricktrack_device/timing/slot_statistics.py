@@ -34,25 +34,28 @@ def interval_errors_us(blocks: Sequence[Block], period_ns: int) -> FloatArray:
 def drift_ppm(blocks: Sequence[Block], period_ns: int) -> tuple[float, float]:
     """Return how fast the reads run away from the slots, in parts per million, and its standard error.
 
-    A line fitted to lateness against time in each block; slopes are weighted by their certainty. NaN where
-    no block has ten reads.
+    A straight line fitted to lateness against time: one for the whole test where the slots of all blocks lie
+    on one grid, as the sampler's do; otherwise one slope for all blocks, each with a level of its own. NaN
+    with fewer than ten reads.
     """
-    slopes, weights = [], []
-    for b in blocks:
-        if len(b.records) < 10:
-            continue
-        due = np.array([r.slot for r in b.records], dtype=np.float64) * period_ns
-        late = np.array([r.t_before_ns - b.t0_ns for r in b.records], dtype=np.float64) - due
-        x = due - due.mean()
-        slope = float(x @ late / (x @ x))
-        rest = late - late.mean() - slope * x
-        variance = float(rest @ rest) / (len(rest) - 2) / float(x @ x)
-        slopes.append(slope)
-        weights.append(1 / max(variance, 1e-24))
-    if not slopes:
+    blocks = [b for b in blocks if len(b.records) >= 2]
+    if sum(len(b.records) for b in blocks) < 10:
         return float("nan"), float("nan")
-    w = np.array(weights)
-    return float(w @ np.array(slopes) / w.sum() * 1e6), float(1e6 / np.sqrt(w.sum()))
+    start_ns = blocks[0].t0_ns
+    on_one_grid = all((b.t0_ns - start_ns) % period_ns == 0 for b in blocks)
+    times, lates = [], []
+    for b in blocks:
+        slots = np.array([r.slot for r in b.records], dtype=np.float64)
+        due = slots * period_ns + (b.t0_ns - start_ns)
+        late = np.array([r.t_before_ns - b.t0_ns for r in b.records], dtype=np.float64) - slots * period_ns
+        times.append(due if on_one_grid else due - due.mean())
+        lates.append(late if on_one_grid else late - late.mean())
+    x, y = np.concatenate(times), np.concatenate(lates)
+    x, y = x - x.mean(), y - y.mean()
+    slope = float(x @ y / (x @ x))
+    rest = y - slope * x
+    freedom = max(1, len(y) - 1 - (1 if on_one_grid else len(blocks)))
+    return slope * 1e6, float(np.sqrt(rest @ rest / freedom / (x @ x))) * 1e6
 
 
 def accumulated_ms(blocks: Sequence[Block], period_ns: int) -> float:

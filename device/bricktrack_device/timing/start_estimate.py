@@ -1,9 +1,9 @@
 """How long a camera takes to start, estimated from counts of frames: the source paper's eqs 28 to 30.
 
-A recording is stopped ``window`` after the command that started it and holds n frames of period T. The time
-that is missing, ``window - n T``, is the initialisation time, but for the fraction of a period between the last
-frame and the stop. That fraction is anything between 0 and T: on average T/2, which is taken off here, with a
-variance of T^2 / 12, which Sheppard's correction takes off the variance over the runs.
+A recording is stopped ``window`` after the command that started it and holds n frames of period T. What is
+missing, ``window - n T``, is the initialisation time, but for the fraction of a period between the last
+frame and the stop. That fraction is anything between 0 and T: on average T/2, which is taken off here, with
+a variance of T^2 / 12, which Sheppard's correction takes off the variance over the runs.
 """
 
 from collections.abc import Sequence
