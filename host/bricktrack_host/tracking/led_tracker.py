@@ -8,18 +8,21 @@ another light, are flagged.
 
 import logging
 from collections.abc import Callable, Iterable
+from contextlib import closing
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
-from bricktrack_common.camera_model import RayModel
+from bricktrack_common.camera_model import RayModel, SensorMode
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_identity import Identities, SegmentMethod, identify_run
 from bricktrack_host.tracking.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.look_ahead import look_ahead
 from bricktrack_host.tracking.segment import Blobs, PaperLimits, Picture, find_blobs, paper_filter
 from bricktrack_host.tracking.verification import MIN_INLIERS
 from bricktrack_host.tracks import LedObservations
@@ -48,8 +51,8 @@ def observe_leds(
     Parameters
     ----------
     pictures : iterable of (int, Picture)
-        Index of the frame and its picture, in time order; a picture is not kept. Frames that do not come are
-        flagged `PoseFlag.FRAME_LOST`.
+        Index of the frame and its picture, in time order; taken in a thread of their own, two ahead, and not
+        kept. Frames that do not come are flagged `PoseFlag.FRAME_LOST`.
     ray_model : RayModel
     brick_model : BrickModel
     sensor_timestamp_ns, exposure_ns : array_like of int64, shape (n_frames,)
@@ -89,29 +92,13 @@ def observe_leds(
         frame_flags=np.full(n, int(PoseFlag.FRAME_LOST | PoseFlag.NO_POSE), dtype=np.int64),
     )
     radius_px = usual_radius_px(ray_model, brick_model)
-    limits = PaperLimits.for_radius(radius_px)
-    lights: list[Blobs | None] = [None] * n
-    mode = ray_model.sensor_mode
-    last = -1
-    for done, (i, picture) in enumerate(pictures, start=1):
-        if not last < i < n:
-            raise TrackingError(
-                f"picture of frame {i} after frame {last}, with {n} time stamps; expected rising indices "
-                "below their number"
-            )
-        if picture.luma.shape != (mode.height, mode.width):
-            raise TrackingError(
-                f"frame {i} has {picture.luma.shape[1]} x {picture.luma.shape[0]} pixels; the calibration is "
-                f"of mode {mode.name}, {mode.width} x {mode.height}. Use the calibration of the run's mode."
-            )
-        last = i
-        lights[i] = (
-            paper_filter(picture, limits=limits)
-            if method == "paper"
-            else find_blobs(picture, radius_px=radius_px)
-        )
-        if progress is not None:
-            progress(done)
+    find = (
+        partial(paper_filter, limits=PaperLimits.for_radius(radius_px))
+        if method == "paper"
+        else partial(find_blobs, radius_px=radius_px)
+    )
+    with closing(look_ahead(pictures)) as ahead:
+        lights = _find_lights(ahead, find, n, ray_model.sensor_mode, progress)
     found = identify_run(
         lights,
         stamps,
@@ -142,6 +129,33 @@ def observe_leds(
     if n_lost:
         logger.warning("%d of %d frames without identified LEDs", n_lost, n)
     return out
+
+
+def _find_lights(
+    pictures: Iterable[tuple[int, Picture]],
+    find: Callable[[Picture], Blobs],
+    n_frames: int,
+    mode: SensorMode,
+    progress: Callable[[int], None] | None,
+) -> list[Blobs | None]:
+    lights: list[Blobs | None] = [None] * n_frames
+    last = -1
+    for done, (i, picture) in enumerate(pictures, start=1):
+        if not last < i < n_frames:
+            raise TrackingError(
+                f"picture of frame {i} after frame {last}, with {n_frames} time stamps; expected rising "
+                "indices below their number"
+            )
+        if picture.luma.shape != (mode.height, mode.width):
+            raise TrackingError(
+                f"frame {i} has {picture.luma.shape[1]} x {picture.luma.shape[0]} pixels; the calibration is "
+                f"of mode {mode.name}, {mode.width} x {mode.height}. Use the calibration of the run's mode."
+            )
+        last = i
+        lights[i] = find(picture)
+        if progress is not None:
+            progress(done)
+    return lights
 
 
 def _frame_flags(found: Identities, i: int) -> int:
