@@ -13,7 +13,9 @@ HERE = Path(__file__).parent
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("name", ["guest_pins", "guest_bus", "guest_subdev", "guest_daemon", "guest_install"])
+@pytest.mark.parametrize(
+    "name", ["guest_pins", "guest_trigger", "guest_bus", "guest_subdev", "guest_daemon", "guest_install"]
+)
 def test_inside(guest, name):
     arguments = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", "/dev/null", "--rootdir", str(HERE)]
     done = guest([*arguments, "-W", "error", str(HERE / f"{name}.py")])
