@@ -181,7 +181,7 @@ def print_report(result: Result, console: Console | None = None) -> None:
         console.print(words, markup=False, highlight=False)
     grid = result.figures["grid"]
     console.print("\nlateness of the sampler's reads after their slots:", highlight=False)
-    top = max(grid["lateness_us_p99.9"], 1.0)
+    top = max(2 * grid["lateness_us_p99"], 1.0)
     for line in text_histogram(result.values["grid_lateness_us"], unit="us", limits=(0.0, top)):
         console.print(line, markup=False, highlight=False)
 

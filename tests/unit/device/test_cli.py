@@ -1,3 +1,4 @@
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -45,3 +46,20 @@ def test_importing_the_command_line_stays_small() -> None:
 def test_the_simulated_unit_passes_its_own_check(tmp_path: Path) -> None:
     done = bricktrackd("check", "--backend", "sim", "--storage", str(tmp_path), "--port", "0", "--json")
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("command", ["imu-test", "start-test", "timing-test"])
+def test_a_timing_tool_says_what_it_does_and_how_to_call_it(command: str) -> None:
+    done = bricktrackd(command, "--help")
+    assert done.returncode == 0 and f"bricktrackd {command}" in done.stdout.split("Example", 1)[1]
+
+
+def test_a_measurement_is_printed_as_json_and_written(tmp_path: Path) -> None:
+    path = tmp_path / "imu.json"
+    done = bricktrackd("imu-test", "--backend", "sim", "--slots", "100", "--json", "--output", str(path))
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
+    assert printed == json.loads(path.read_text())
+    assert (
+        printed["tool"] == "imu-test" and printed["simulated"] and printed["figures"]["grid"]["slots"] == 100
+    )
