@@ -33,6 +33,7 @@ from bricktrack_host.fusion.smoother import (
     BG,
     GRAV,
     LAG,
+    LOSS,
     POS,
     SKEW,
     TAU,
@@ -73,6 +74,8 @@ class FusionResult:
         The convention is `TimeAlignment`'s.
     acc_lag_ns, acc_lag_sd_ns : float, ns
         Specific force at t is the sample stamped t + this.
+    acc_loss_s2, acc_loss_sd_s2 : float, s^2
+        What the accelerometer's low-pass takes from its second derivative.
     gyro_bias_radps, gyro_bias_sd_radps, acc_bias_mps2, acc_bias_sd_mps2 : ndarray, shape (3,)
         Mean over the run; brick axes.
     gravity_camera_mps2, gravity_sd_mps2 : ndarray, shape (3,), camera axes
@@ -98,6 +101,8 @@ class FusionResult:
     skew_sd: float
     acc_lag_ns: float
     acc_lag_sd_ns: float
+    acc_loss_s2: float
+    acc_loss_sd_s2: float
     gyro_bias_radps: FloatArray
     gyro_bias_sd_radps: FloatArray
     acc_bias_mps2: FloatArray
@@ -251,6 +256,7 @@ def _relinearise(estimate: Estimate, b: int, n_nodes: int, settings: FusionSetti
         tau_s=float(x[0, TAU]),
         skew=float(x[0, SKEW]),
         lag_s=float(x[0, LAG]),
+        loss_s2=max(float(x[0, LOSS]), 0.0),
         bg_radps=x[:, BG].mean(axis=0),
         ba_mps2=x[:, BA].mean(axis=0),
         R_first=nearest_rotation(estimate.state.R[0, b]),
@@ -368,6 +374,7 @@ def _fuse_together(
         used[b] = good if good.mean() > 0.5 else used[b]  # else it is not the frames that are wrong
     # Relinearised once, with what the first pass found of clocks, noise and outliers.
     lins = [_relinearise(estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
+    runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(runs, lins, strict=True)]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
     problem, _ = build_problem(
         runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
@@ -413,6 +420,8 @@ def _fuse_together(
                 skew_sd=float(sd[SKEW]),
                 acc_lag_ns=float(x[0, LAG] * 1e9),
                 acc_lag_sd_ns=float(sd[LAG] * 1e9),
+                acc_loss_s2=float(x[0, LOSS]),
+                acc_loss_sd_s2=float(sd[LOSS]),
                 gyro_bias_radps=x[:, BG].mean(axis=0),
                 gyro_bias_sd_radps=sd[BG],
                 acc_bias_mps2=x[:, BA].mean(axis=0),

@@ -1,6 +1,6 @@
 """From tracks to the smoother's problem: nodes in time, noise of each step, start values and their sd."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from bricktrack_host.fusion.smoother import (
     BG,
     GRAV,
     LAG,
+    LOSS,
     N_STATES,
     POS,
     SKEW,
@@ -35,6 +36,7 @@ class Linearisation:
     tau_s: float
     skew: float
     lag_s: float
+    loss_s2: float
     bg_radps: FloatArray
     ba_mps2: FloatArray
     R_first: FloatArray
@@ -55,6 +57,7 @@ class Run:
         Their index in the optical track.
     """
 
+    imu: ImuTrack
     signal: ImuSignal
     alignment: TimeAlignment
     lever_arm_m: FloatArray
@@ -77,7 +80,7 @@ class Run:
         output_t_ns: IntArray,
     ) -> "Run":
         """Return what of a run is used: frames with a pose, and the time to be covered."""
-        signal = ImuSignal.from_track(imu)
+        signal = ImuSignal.from_track(imu, gyro_filter_s=alignment.gyro_filter_s)
         seen = np.flatnonzero(has_pose(optical))
         t_cam_s = seconds_since(optical.t_ns[seen], signal.epoch_ns)
         cov = optical.covariance[seen].copy()
@@ -94,6 +97,7 @@ class Run:
             float(max(t_cam_s[-1], min(last, wanted_s.max(initial=-np.inf)))),
         )
         return cls(
+            imu=imu,
             signal=signal,
             alignment=alignment,
             lever_arm_m=lever_arm_mm * 1e-3,
@@ -105,6 +109,15 @@ class Run:
             t_mid_s=(alignment.t_mid_ns - signal.epoch_ns) * 1e-9,
             span_cam_s=span,
         )
+
+    def with_acc_loss(self, loss_s2: float) -> "Run":
+        """Return the run with the accelerometer's low-pass undone as far as is known now."""
+        signal = ImuSignal.from_track(
+            self.imu,
+            gyro_filter_s=self.alignment.gyro_filter_s,
+            acc_filter_s=float(np.sqrt(max(loss_s2, 0.0))),
+        )
+        return replace(self, signal=signal)
 
     def imu_time_s(self, t_cam_s: FloatArray, lin: Linearisation) -> FloatArray:
         """Return IMU time of camera time at the linearisation point."""
@@ -139,6 +152,7 @@ def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
         tau_s=tau,
         skew=a.skew,
         lag_s=lag,
+        loss_s2=0.0,
         bg_radps=np.asarray(a.gyro_bias_radps, dtype=np.float64),
         ba_mps2=np.zeros(3),
         R_first=run.R_seen[0],
@@ -242,7 +256,7 @@ def noise_parts(
 
 
 def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> FloatArray:
-    """Return the covariance of the start values, shape (21, 21): wide where the first frames will tell."""
+    """Return the covariance of the start values, shape (22, 22): wide where the first frames will tell."""
     s, a = settings, run.alignment
     sd = np.zeros(N_STATES)
     sd[ATT], sd[POS], sd[VEL] = 0.2, 1.0, 1.0
@@ -252,7 +266,7 @@ def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> 
         sd[SKEW] = 2 * a.skew_sd
     else:
         sd[TAU], sd[SKEW] = a.offset_sd_ns * 1e-9, a.skew_sd
-    sd[LAG] = s.acc_lag_sd_ns * 1e-9
+    sd[LAG], sd[LOSS] = s.acc_lag_sd_ns * 1e-9, s.acc_loss_sd_s2
     P = np.diag(sd**2)
     along = lin.gravity_mps2 / np.linalg.norm(lin.gravity_mps2)
     P[GRAV, GRAV] += (s.gravity_sd_mps2**2 - sd[GRAV.start] ** 2) * np.outer(along, along)
@@ -295,6 +309,7 @@ def build_problem(
         dv_mps=zeros3.copy(),
         dp_m=zeros3.copy(),
         f_rate_mps3=zeros3.copy(),
+        f_curve_mps4=zeros3.copy(),
         gyro_var=np.zeros(steps),
         acc_var=np.zeros(steps),
         gyro_bias_walk=np.full(steps, settings.gyro_bias_walk_radps**2),
@@ -311,6 +326,7 @@ def build_problem(
         tau_lin=np.array([x.tau_s for x in lins]),
         skew_lin=np.array([x.skew for x in lins]),
         lag_lin=np.array([x.lag_s for x in lins]),
+        loss_lin=np.array([x.loss_s2 for x in lins]),
         start=State(np.empty((n_runs, 3, 3)), np.zeros((n_runs, N_STATES))),
         P_start=np.stack([start_covariance(r, x, settings) for r, x in zip(runs, lins, strict=True)]),
     )
@@ -325,7 +341,8 @@ def build_problem(
         )
         pr.dt_s[:k, b] = np.diff(node.t_s)
         pr.R_step[:k, b], pr.R_half[:k, b] = step.R, step.R_half
-        pr.dv_mps[:k, b], pr.dp_m[:k, b], pr.f_rate_mps3[:k, b] = step.dv_mps, step.dp_m, step.f_rate_mps3
+        pr.dv_mps[:k, b], pr.dp_m[:k, b] = step.dv_mps, step.dp_m
+        pr.f_rate_mps3[:k, b], pr.f_curve_mps4[:k, b] = step.f_rate_mps3, step.f_curve_mps4
         middle = 0.5 * (node.t_s[1:] + node.t_s[:-1])
         parts.append(noise_parts(run.signal, middle, lin, settings))
         pr.gyro_var[:k, b], pr.acc_var[:k, b] = parts[b].gyro(levels[b][0]), parts[b].acc(levels[b][1])

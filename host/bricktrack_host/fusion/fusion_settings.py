@@ -37,6 +37,9 @@ class FusionSettings:
         A measured alignment enters no tighter than this, nor than its own sd.
     acc_lag_ns, acc_lag_sd_ns : float, ns
         Accelerometer minus gyro low-pass lag, and how well it is known; BNO055 default bandwidths: -3.4 ms.
+    acc_loss_sd_s2 : float, s^2
+        Of what the accelerometer's low-pass takes from its second derivative: for a critically damped one of
+        second order half the delay squared, 3e-6 at the BNO055's 62.5 Hz. None is expected.
     optical_common_share : float
         Part of the optical sd that neighbouring frames have in common (LED profile, calibration, pixel grid)
         and that no averaging over frames takes away. It is added to the covariance that is given out.
@@ -67,6 +70,7 @@ class FusionSettings:
     offset_prior_sd_ns: float = 0.15e6
     acc_lag_ns: float = 0.0
     acc_lag_sd_ns: float = 4e6
+    acc_loss_sd_s2: float = 4e-6
     optical_common_share: float = 0.3
     gate_chi2: float = 33.0
     impact_mps2: float = 3.0

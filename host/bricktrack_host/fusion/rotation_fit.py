@@ -18,6 +18,7 @@ _NODE_S = 0.0025  # of the integrated gyro
 _KNOT_S = 0.5  # of the slow drift between integrated gyro and optics: its noise, bias and scale error
 _AMBIGUOUS_SIGMA = 5.0
 _MISFIT_CAP = 25.0
+LOSS_PRIOR_SD_S2 = 2e-5  # of c: 4.5 ms squared, the BNO055's narrower settings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +31,7 @@ class Fit:
 
     offset_s: float
     skew: float
+    loss_s2: float
     bias_radps: FloatArray
     bias_sd_radps: FloatArray
     covariance: FloatArray
@@ -174,7 +176,9 @@ class RotationFit:
         n, n_knots = basis.shape
         self._remove_bias(np.zeros(3))
         offset, skew, sd = float(offset_s), 0.0, float("nan")
-        covariance, bias_covariance = np.eye(2), np.eye(3)
+        covariance, bias_covariance = np.eye(3), np.eye(3)
+        prior = np.diag([0.0, self._skew_prior_sd**-2, LOSS_PRIOR_SD_S2**-2])
+        lost = 0.0
         weight = np.ones(n)
         for iteration in range(12):
             t_imu = t + offset + skew * (t - self._t_mid)
@@ -186,18 +190,23 @@ class RotationFit:
             rate = np.einsum("nij,nj->ni", attitude, self._signal.gyro_at(t_imu) - self._gyro_bias)
             w = weight * inverse_sd
             Q, _ = np.linalg.qr(w[:, None] * basis)
-            design = np.stack([rate, (t - self._t_mid)[:, None] * rate], axis=2)  # (n, 3, [offset, skew])
+            # A low-pass takes c times its second derivative from the rate, and so c times its first from
+            # the angle.
+            slow = np.einsum("nij,nj->ni", attitude, self._signal.gyro_rate_at(t_imu))
+            # (n, 3, [offset, skew, c])
+            design = np.stack([rate, (t - self._t_mid)[:, None] * rate, -slow], axis=2)
             # The knots are eliminated: what they can explain is taken out of both sides.
             A = np.einsum("n,nij->nij", w, design)
             A = A - np.einsum("nk,mk,mij->nij", Q, Q, A, optimize=True)
             y = w[:, None] * error
             y = y - Q @ (Q.T @ y)
-            normal = np.einsum("nij,nik->jk", A, A) + np.diag([0.0, self._skew_prior_sd**-2])
+            normal = np.einsum("nij,nik->jk", A, A) + prior
             if not (np.isfinite(normal).all() and normal[0, 0] > 0):
                 return None
-            right = np.einsum("nij,ni->j", A, y) - np.array([0.0, skew * self._skew_prior_sd**-2])
+            right = np.einsum("nij,ni->j", A, y) - np.array([0.0, skew, 0.0]) @ prior
             step = np.linalg.solve(normal, right)
             remainder = error - design @ step
+            lost = float(step[2])
             drift = basis @ np.linalg.lstsq(w[:, None] * basis, w[:, None] * remainder, rcond=None)[0]
             residual = np.linalg.norm((remainder - drift) * inverse_sd[:, None], axis=1) / np.sqrt(3)
             freedom = max(n - n_knots - 1, 1) / n
@@ -214,7 +223,7 @@ class RotationFit:
                 break
         bias, bias_covariance = self._bias(t, attitude, drift, sd * self._sd[inside])
         misfit = 3 * float(np.minimum(residual**2, _MISFIT_CAP * sd**2).sum())
-        return Fit(offset, skew, self._gyro_bias + bias, np.sqrt(np.diag(bias_covariance)), covariance, sd, misfit, n)
+        return Fit(offset, skew, lost, self._gyro_bias + bias, np.sqrt(np.diag(bias_covariance)), covariance, sd, misfit, n)
 
     @staticmethod
     def _bias(

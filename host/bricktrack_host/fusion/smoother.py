@@ -1,8 +1,9 @@
 """Error-state Kalman filter on the manifold with a fixed-interval smoother, for a batch of runs at once.
 
-The equations are DESIGN 8.2's. SI units inside. Error state, 21 components: attitude (body axes), position
+The equations are DESIGN 8.2's. SI units inside. Error state, 22 components: attitude (body axes), position
 and velocity of the IMU point (camera axes), gyro and accelerometer bias, gravity (camera axes), time offset,
-clock skew, accelerometer-minus-gyro lag. Arrays put time first and the runs of the batch second, so that each
+clock skew, accelerometer-minus-gyro lag, and what the accelerometer's low-pass takes from its second
+derivative. Arrays put time first and the runs of the batch second, so that each
 step of the one loop over time works on contiguous memory; a run shorter than the others is padded with empty
 steps.
 """
@@ -15,10 +16,10 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
 
-N_STATES = 21
+N_STATES = 22
 N_MOVING = 9  # attitude, position, velocity: the others stand still or wander
 ATT, POS, VEL, BG, BA, GRAV = (slice(3 * i, 3 * i + 3) for i in range(6))
-TAU, SKEW, LAG = 18, 19, 20
+TAU, SKEW, LAG, LOSS = 18, 19, 20, 21
 _NIS_CAP = 100.0  # so that an outlier does not choose the noise
 CHI2_6_95 = 12.59  # 95 % point of chi-square with 6 degrees of freedom
 
@@ -32,8 +33,8 @@ class Problem:
     dt_s : ndarray, shape (K - 1, B)
         Zero where a run is already over.
     R_step, R_half : ndarray, shape (K - 1, B, 3, 3)
-    dv_mps, dp_m, f_rate_mps3 : ndarray, shape (K - 1, B, 3)
-        Increments at the linearisation point of biases and lag, see `imu_signal.Increments`.
+    dv_mps, dp_m, f_rate_mps3, f_curve_mps4 : ndarray, shape (K - 1, B, 3)
+        Increments at the linearisation point of biases, lag and loss, see `imu_signal.Increments`.
     gyro_var, acc_var : ndarray, shape (K - 1, B), rad^2/s and m^2/s^3
         Spectral densities of the inertial noise.
     gyro_bias_walk, acc_bias_walk : ndarray, shape (K - 1, B), rad^2/s^3 and m^2/s^5
@@ -46,10 +47,10 @@ class Problem:
         Camera time of the frame less that of the run's middle.
     lever_arm_m : ndarray, shape (B, 3)
     bg_lin, ba_lin : ndarray, shape (B, 3)
-    tau_lin, skew_lin, lag_lin : ndarray, shape (B,)
+    tau_lin, skew_lin, lag_lin, loss_lin : ndarray, shape (B,)
         Where increments and node times were taken.
     start : State
-    P_start : ndarray, shape (B, 21, 21)
+    P_start : ndarray, shape (B, 22, 22)
     """
 
     dt_s: FloatArray
@@ -58,6 +59,7 @@ class Problem:
     dv_mps: FloatArray
     dp_m: FloatArray
     f_rate_mps3: FloatArray
+    f_curve_mps4: FloatArray
     gyro_var: FloatArray
     acc_var: FloatArray
     gyro_bias_walk: FloatArray
@@ -74,6 +76,7 @@ class Problem:
     tau_lin: FloatArray
     skew_lin: FloatArray
     lag_lin: FloatArray
+    loss_lin: FloatArray
     start: "State"
     P_start: FloatArray
 
@@ -85,7 +88,7 @@ class Problem:
         gyro_var, acc_var : ndarray, shape (K - 1, B, n_choices)
         """
         n = gyro_var.shape[2]
-        per_run = {"lever_arm_m", "bg_lin", "ba_lin", "tau_lin", "skew_lin", "lag_lin", "P_start"}
+        per_run = {"lever_arm_m", "bg_lin", "ba_lin", "tau_lin", "skew_lin", "lag_lin", "loss_lin", "P_start"}
         changed: dict[str, Any] = {
             f.name: np.repeat(getattr(self, f.name), n, axis=0 if f.name in per_run else 1)
             for f in fields(self)
@@ -99,12 +102,12 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Attitude and the 18 additive components, for any leading shape.
+    """Attitude and the 19 additive components, for any leading shape.
 
     Attributes
     ----------
     R : ndarray, shape (..., 3, 3)
-    x : ndarray, shape (..., 21)
+    x : ndarray, shape (..., 22)
         By the error state's indices; the attitude's three stay zero.
     """
 
@@ -119,7 +122,7 @@ class Estimate:
     Attributes
     ----------
     state : State, leading shape (K, B)
-    covariance : ndarray, shape (K, B, 21, 21)
+    covariance : ndarray, shape (K, B, 22, 22)
     nis : ndarray, shape (K, B)
         Innovation squared over its covariance (6 degrees of freedom), NaN where no frame; only of the filter.
     """
@@ -166,7 +169,7 @@ def observe(
 
     Returns
     -------
-    R, p_m, H : ndarray, shape (..., 3, 3), (..., 3), (..., 6, 21)
+    R, p_m, H : ndarray, shape (..., 3, 3), (..., 3), (..., 6, 22)
     """
     arm = _matvec(state.R, np.broadcast_to(lever_arm_m, omega_radps.shape))
     v_origin = state.x[..., VEL] - _matvec(state.R, np.cross(omega_radps, lever_arm_m))
@@ -184,7 +187,7 @@ def observe(
 
 
 def residuals(problem: Problem, state: State, at: IntArray, b: int) -> tuple[FloatArray, FloatArray]:
-    """Return optical residuals, shape (n, 6), and Jacobians, shape (n, 6, 21), at nodes of one run."""
+    """Return optical residuals, shape (n, 6), and Jacobians, shape (n, 6, 22), at nodes of one run."""
     R_at, x = state.R[at, b], state.x[at, b]
     since_mid = problem.since_mid_s[at, b]
     dt = (x[:, TAU] - problem.tau_lin[b]) + since_mid * (x[:, SKEW] - problem.skew_lin[b])
@@ -208,13 +211,13 @@ def _process_noise(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 
 def _sensitivities(problem: Problem) -> FloatArray:
-    """Return, in body axes, what changes dv: attitude, accelerometer bias, lag; and then the same for dp.
+    """Return, in body axes, what changes dv: attitude, accelerometer bias, lag, loss; then the same for dp.
 
-    Shape (K - 1, B, 6, 7): rows dv, dp; columns theta (3), ba (3), lag.
+    Shape (K - 1, B, 6, 8): rows dv, dp; columns theta (3), ba (3), lag, loss.
     """
     dt = problem.dt_s[..., None, None]
-    out = np.zeros((*problem.dt_s.shape, 6, 7))
-    rate = _matvec(problem.R_half, problem.f_rate_mps3)[..., None]
+    out = np.zeros((*problem.dt_s.shape, 6, 8))
+    rate = problem.R_half @ np.stack([problem.f_rate_mps3, -problem.f_curve_mps4], axis=-1)
     out[..., :3, :3] = -skew(problem.dv_mps)
     out[..., 3:, :3] = -skew(problem.dp_m)
     out[..., :3, 3:6] = -problem.R_half * dt
@@ -256,6 +259,7 @@ class Filter:
     def _run(self, keep: bool) -> None:
         pr = self._problem
         n_nodes, n_runs = pr.has_frame.shape
+        sensor_lin = np.stack([pr.lag_lin, pr.loss_lin], axis=1)
         any_frame = np.asarray(pr.has_frame.any(axis=1))
         effect, dt1 = _sensitivities(pr), pr.dt_s[..., None]
         Q, Q_walk = _process_noise(pr)
@@ -266,15 +270,15 @@ class Filter:
         for k in range(n_nodes):
             if k:
                 j, dt = k - 1, dt1[k - 1]
-                turned = R[:, None] @ effect[j].reshape(n_runs, 2, 3, 7)  # dv, dp in camera axes
+                turned = R[:, None] @ effect[j].reshape(n_runs, 2, 3, 8)  # dv, dp in camera axes
                 F[:, ATT, ATT] = np.swapaxes(pr.R_step[j], -1, -2)
                 F[:, i3, 9 + i3] = -dt
                 F[:, 3 + i3, 6 + i3] = F[:, 6 + i3, 15 + i3] = dt
                 F[:, 3 + i3, 15 + i3] = 0.5 * dt * dt
                 F[:, VEL, ATT], F[:, POS, ATT] = turned[:, 0, :, :3], turned[:, 1, :, :3]
                 F[:, VEL, BA], F[:, POS, BA] = turned[:, 0, :, 3:6], turned[:, 1, :, 3:6]
-                F[:, VEL, LAG], F[:, POS, LAG] = turned[:, 0, :, 6], turned[:, 1, :, 6]
-                off = np.concatenate([x[:, BA] - pr.ba_lin, (x[:, LAG] - pr.lag_lin)[:, None]], axis=1)
+                F[:, VEL, LAG:], F[:, POS, LAG:] = turned[:, 0, :, 6:], turned[:, 1, :, 6:]
+                off = np.concatenate([x[:, BA] - pr.ba_lin, x[:, LAG:] - sensor_lin], axis=1)
                 step = R @ np.stack([pr.dv_mps[j], pr.dp_m[j]], axis=2)
                 step = np.swapaxes(step, 1, 2) + _matvec(turned[..., 3:], off[:, None])  # (B, [dv, dp], 3)
                 x[:, POS] += dt * x[:, VEL] + 0.5 * dt * dt * x[:, GRAV] + step[:, 1]

@@ -22,6 +22,8 @@ logger = logging.getLogger(__name__)
 _MIN_VECTOR_CORRELATION = 0.4  # noise alone stays below 0.2 over 400 frames
 _CLEAR_SPEED_CORRELATION = 0.8
 _UNKNOWN_BIAS_RADPS = 0.02  # BNO055 data sheet: zero-rate offset at most 3 deg/s, typically 1
+_FILTER_ROUNDS = 2
+_FILTER_SIGMA = 2.5
 MIN_ROTATION_SD_RAD = 1e-5  # a covariance below this is not believed
 
 
@@ -50,6 +52,9 @@ class TimeAlignment:
         The motion says an offset that the stamps' prior does not allow (beyond four sd).
     reason : str
         Why it is not trusted, or how it disagrees; empty when all is well.
+    gyro_filter_s : float, s
+        Time constant of the gyroscope's low-pass, were it of second order and critically damped: what the
+        optical attitudes say of its amplitudes. Zero where they find none.
     sample_clock : SampleClock or None
         When the sensor truly took its samples, where the stamps of its reads do not say. The IMU time above
         is then that of the samples.
@@ -68,6 +73,7 @@ class TimeAlignment:
     is_trusted: bool
     disagrees_with_stamps: bool
     reason: str
+    gyro_filter_s: float = 0.0
     sample_clock: SampleClock | None = None
 
     def imu_time_ns(self, t_ns: IntArray) -> IntArray:
@@ -226,6 +232,18 @@ def align_times(
             return from_stamps(f"the motion repeats: offsets of {told} ms fit equally well", None, speed)
         best = near[0]
         reason = "the motion repeats; of the offsets that fit, the one that the stamps allow was taken"
+    gyro_filter_s = 0.0
+    for _ in range(_FILTER_ROUNDS):
+        # Only what stands out of its uncertainty: a filter that is not there shall cost nothing.
+        loss_s2 = gyro_filter_s**2 + best.loss_s2
+        if loss_s2 < _FILTER_SIGMA * np.sqrt(best.covariance[2, 2]):
+            break
+        filter_s = float(np.sqrt(loss_s2))
+        sharp = ImuSignal.from_track(imu, gyro_filter_s=filter_s)
+        again = RotationFit(t_s, R, sd_rad, sharp, skew_prior_sd=skew_prior_sd).solve(best.offset_s)
+        if again is None:
+            break
+        best, gyro_filter_s = again, filter_s
     off = best.offset_s * 1e9 - prior_offset_ns
     disagrees = bool(abs(off) > 4 * np.hypot(prior_sd_ns, best.offset_sd_s * 1e9))
     if disagrees:
@@ -248,4 +266,5 @@ def align_times(
         is_trusted=True,
         disagrees_with_stamps=disagrees,
         reason=reason,
+        gyro_filter_s=gyro_filter_s,
     )
