@@ -61,7 +61,7 @@ def test_every_rising_edge_is_logged_with_its_stamp(factory, hz, n_periods):
 
 
 def test_a_glitch_before_the_wave_is_not_its_first_edge(factory):
-    trigger = Trigger(factory, TriggerTable(nominal_hz=50.0, quiet_gap_ms=100.0))
+    trigger = Trigger(factory, TriggerTable(nominal_hz=20.0, quiet_gap_ms=100.0))
     firsts = []
     trigger.arm(lambda: firsts.append(1))
     time.sleep(0.2)
@@ -71,17 +71,17 @@ def test_a_glitch_before_the_wave_is_not_its_first_edge(factory):
     time.sleep(0.3)
     assert trigger.t0_ns is None and not firsts
     assert "waits for others in step" in trigger.waiting_words()
-    rises = guest_knobs.rises_of(guest_knobs.square_wave(17, hz=50, n_periods=40))
+    rises = guest_knobs.rises_of(guest_knobs.square_wave(17, hz=20, n_periods=30))
     time.sleep(0.3)
     train = trigger.disarm()
     trigger.close()
     assert len(train.rejected_ns) == 1 and firsts == [1]
-    assert len(train.edges_ns) == len(rises) == 40
+    assert len(train.edges_ns) == len(rises) == 30
     assert rises[0][0] - 1000 <= train.t0_ns <= rises[0][1] + 1000
     wave, words = judge_edges(
-        train.edges_ns, nominal_hz=50.0, end_ns=train.edges_ns[-1], rejected_ns=train.rejected_ns
+        train.edges_ns, nominal_hz=20.0, end_ns=train.edges_ns[-1], rejected_ns=train.rejected_ns
     )
-    assert wave.hz == pytest.approx(50, rel=0.02)  # single edges may be late: one processor under ptrace
+    assert wave.hz == pytest.approx(20, rel=0.02)  # single edges may be late: one processor under ptrace
     assert "1 rising edges before t = 0" in words[0]
 
 
