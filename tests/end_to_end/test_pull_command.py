@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from bricktrack_common.errors import VideoError
 from bricktrack_common.run_folder import read_run
-from bricktrack_common.wire_messages import Read
+from bricktrack_common.wire_messages import HealthItem, Read
 from bricktrack_host.cli import app
 from bricktrack_host.cli.main import make_pull_command
 
@@ -45,6 +45,23 @@ def test_status_tells_people_and_scripts_the_same(card):
     assert told["units"][0]["answers"] is True
     assert told["units"][0]["status"]["state"] == "idle"
     assert told["units"][0]["status"]["runs"] == 2
+
+
+def test_status_shows_the_worst_of_a_units_health_and_all_of_it_to_scripts(card):
+    with FakeUnit(card) as unit:
+        unit.health = [
+            HealthItem(name="clocks", level="ok", words="1 us"),
+            HealthItem(name="temperature", level="warn", words="78.0 °C", remedy="Give the unit air"),
+        ]
+        seen = invoke("status", "--address", unit.address)
+        told = json.loads(invoke("status", "--address", unit.address, "--json").stdout)
+        unit.health.append(HealthItem(name="storage", level="fail", words="full", remedy="Pull runs"))
+        worse = invoke("status", "--address", unit.address)
+    assert seen.exit_code == 0
+    assert "warn: temperature" in " ".join(seen.stdout.split())
+    assert "Give the unit air" in seen.stderr
+    assert [h["level"] for h in told["units"][0]["status"]["health"]] == ["ok", "warn"]
+    assert "fail: storage" in " ".join(worse.stdout.split())
 
 
 def test_status_of_a_silent_unit_exits_with_1_and_still_shows_the_others(card, tmp_path):

@@ -20,6 +20,7 @@ from bricktrack_common.wire_messages import (
     Disarmed,
     FileSummary,
     GetStatus,
+    HealthItem,
     Hello,
     HelloReply,
     ListRuns,
@@ -50,6 +51,7 @@ class FakeUnit:
         self.requests: list[object] = []
         self.confirmed: set[str] = set()
         self.state = "idle"
+        self.health: list[HealthItem] = []
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -141,5 +143,6 @@ class FakeUnit:
     def _status(self) -> StatusReply:
         return StatusReply(
             unit=self.name, state=self.state, runs=len(self._folders()), disk_free_bytes=10**10,
-            disk_needed_bytes=10**8, frames=0, imus=[], edges=0, clocks=read_clock_triplet(),
+            disk_needed_bytes=10**8, frames=0, imus=[], edges=0, health=self.health,
+            clocks=read_clock_triplet(),
         )  # fmt: skip

@@ -106,6 +106,8 @@ def test_a_host_arms_watches_reads_and_confirms_a_run(unit: Unit, tmp_path: Path
     assert (before.state, before.runs, before.run_id, before.frames) == ("idle", 0, "", 0)
     # Twice 0.5 s at 12 Mbit/s, and 1 MB.
     assert before.disk_needed_bytes == 2_500_000 and before.disk_free_bytes > 0
+    assert {"clocks", "storage", "real-time rights"} <= {item.name for item in before.health}
+    assert before.health_age_s is not None and before.health_age_s < 30
 
     armed, _ = unit.ask(Arm(label="first"))
     assert isinstance(armed, Armed) and armed.missing == []
