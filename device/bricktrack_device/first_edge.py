@@ -18,8 +18,8 @@ N_STEPS_NEEDED = 2
 MAX_EXTRAS = 2
 """Edges out of step among those that confirm; a burst of noise has edges everywhere."""
 STEP_TOLERANCE = 0.1
-"""Of the period. Wider, and more glitches pass; narrower, and a first edge whose interrupt was late is taken for
-one, which shifts the run by a period: 2 ms at 50 Hz is far above what a kernel's stamps scatter by."""
+"""Of the period. Wider, and more glitches pass; narrower, and a first edge whose interrupt was late is taken
+for one, which shifts the run by a period: 2 ms at 50 Hz is far above what a kernel's stamps scatter by."""
 MIN_TOLERANCE_NS = 100_000
 OTHER_WAVE_INTERVALS = 4
 OTHER_WAVE_MAX_NS = 4_000_000_000
