@@ -21,7 +21,8 @@ def thinned(t_s: FloatArray, y: FloatArray, *, n_columns: int = N_COLUMNS) -> In
     """Return which samples draw the same line as all of them, at so many pixels across.
 
     First, least, greatest and last sample of every column of pixels: what lies between them falls on the
-    same pixels, or the ones beside them (Jugel et al., "M4", 2014). Columns with NaN are kept whole, so that gaps stay gaps.
+    same pixels, or the ones beside them (Jugel et al., "M4", 2014). Columns with NaN are kept whole, so that
+    gaps stay gaps.
 
     Parameters
     ----------
