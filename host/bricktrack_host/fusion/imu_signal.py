@@ -1,10 +1,11 @@
 """Inertial samples as continuous signals: splines, how far to trust them, and motion between instants.
 
 Times inside are seconds after `ImuSignal.epoch_ns` on the clock of the samples. "Roughness" is what a sample
-differs from the cubic through its neighbours: noise, or motion faster than the samples can follow.
+differs from the polynomial through its neighbours: noise, or motion faster than the samples can follow.
 """
 
 from dataclasses import dataclass
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ MIN_SAMPLES = 20
 _GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
 _BRIDGE_PERIODS = 3.5  # up to here the cubic may bridge it; beyond, a straight line
 _SUBSTEPS = 4  # of at most 2.5 ms at 100 Hz: cubic signal, exact integrals, coning left below 1e-8 rad
-_PREDICTION_GAIN = 1.394  # sd of (sample - cubic through four neighbours) over sd of one sample, white noise
+# sd of (sample - polynomial through n neighbours on each side) over sd of one sample of white noise
+_PREDICTION_GAIN = {n: comb(4 * n, 2 * n) ** 0.5 / comb(2 * n, n) for n in (2, 4)}
 _STEADY_SAMPLES = 25
 _IMPACT_SIGMA = 5.0
 _CLIP_SHARE = 0.98  # of the range: filters inside the chip round a clipped peak off a little
@@ -66,30 +68,40 @@ def usable_samples(imu: ImuTrack) -> BoolArray:
 def roughness(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return what of a signal is faster than its samples: the steady part, and single impacts.
 
-    Both from how far each sample lies from the cubic through its four neighbours.
-
     Parameters
     ----------
-    values : ndarray, shape (n, 3), n >= 5
+    values : ndarray, shape (n, 3), n >= 9
 
     Returns
     -------
     steady : ndarray, shape (n,), unit of ``values``
-        As the sd of one sample of white noise: from the median over a quarter second at 100 Hz, so that an
-        impact does not count; the greatest of the axes. A smooth signal gives nearly 0.
+        As the sd of one sample of white noise: from how far samples are off the polynomial through their
+        eight neighbours, by the median over a quarter second at 100 Hz, so that an impact does not count; the
+        greatest of the axes. A motion of a fifth of the sample rate gives 3 % of its amplitude, about what
+        the spline loses of it.
     impact : ndarray, shape (n,), unit of ``values``
-        Height of a pulse that stands out of the steady part, at its sample and the two beside it; else 0.
+        Height of a pulse over the cubic through four neighbours where it stands out of what is usual there,
+        at its sample and the two beside it; else 0.
     """
     v = as_float_array("values", values, (None, 3))
-    padded = np.concatenate([v[:1].repeat(2, 0), v, v[-1:].repeat(2, 0)])
-    off = np.abs(v - (4 * (padded[1:-3] + padded[3:-1]) - padded[:-4] - padded[4:]) / 6)
-    off[[0, 1, -2, -1]] = off[[2, 2, -3, -3]]  # the padding is no neighbour
-    window = (min(_STEADY_SAMPLES, len(v)), 1)
-    steady = median_filter(off, window, mode="nearest") / (0.6745 * _PREDICTION_GAIN)
+    steady = _usual(_off_neighbours(v, 4)) / _PREDICTION_GAIN[4]
+    off = _off_neighbours(v, 2)
     # A pulse pulls its neighbours' cubics as well: only the peak counts.
     peak = off >= 0.7 * maximum_filter1d(off, 5, axis=0, mode="nearest")
-    impact = np.where(peak & (off > _IMPACT_SIGMA * _PREDICTION_GAIN * steady), off, 0.0).max(axis=1)
+    impact = np.where(peak & (off > _IMPACT_SIGMA * _usual(off)), off, 0.0).max(axis=1)
     return np.asarray(steady.max(axis=1)), np.asarray(maximum_filter1d(impact, 3, mode="nearest"))
+
+
+def _off_neighbours(values: FloatArray, n_side: int) -> FloatArray:
+    """Return the distance of samples from the polynomial through ``n_side`` neighbours on each side."""
+    off = np.abs(np.diff(values, 2 * n_side, axis=0)) / comb(2 * n_side, n_side)
+    return np.pad(off, ((n_side, n_side), (0, 0)), mode="edge")
+
+
+def _usual(off: FloatArray) -> FloatArray:
+    """Return the sd by the running median of absolute values."""
+    window = (min(_STEADY_SAMPLES, len(off)), 1)
+    return np.asarray(median_filter(off, window, mode="nearest") / 0.6745)
 
 
 def _bridge_clipped(t_s: FloatArray, acc: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:

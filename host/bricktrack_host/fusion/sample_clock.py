@@ -66,7 +66,7 @@ class SampleClock:
 
 
 def find_sample_clock(
-    t_s: FloatArray, R: FloatArray, sd_rad: FloatArray, signal: ImuSignal, imu: ImuTrack, *, offset_s: float
+    t_s: FloatArray, R: FloatArray, sd_rad: FloatArray, signal: ImuSignal, imu: ImuTrack, *, as_read: Fit
 ) -> SampleClock | None:
     """Return the sensor's own clock, or None where the stamps serve as well.
 
@@ -80,9 +80,10 @@ def find_sample_clock(
     signal : ImuSignal
         Of ``imu`` with its stamps as read.
     imu : ImuTrack
-    offset_s : float
-        Stamps less camera time, to some milliseconds.
+    as_read : Fit
+        Of the attitudes to the gyro by those stamps.
     """
+    offset_s = as_read.offset_s
     if len(t_s) <= MIN_PAIRS:
         return None
     search = SawToothSearch(t_s, R, sd_rad, signal, imu, offset_s=offset_s)
@@ -92,7 +93,7 @@ def find_sample_clock(
     earned = search.null_cost() - way.cost
     logger.debug("a saw-tooth of %.0f ppm earns %.0f", way.rate * 1e6, earned)
     # A sample found twice proves a clock of its own, however little the motion shows of it.
-    if earned < (0.0 if search.has_repeats else _EARN):
+    if earned < (-_EARN if search.has_repeats else _EARN):
         return None
 
     def clock_of(way: SawTooth) -> SampleClock:
@@ -128,6 +129,9 @@ def find_sample_clock(
     way, _, fit = best
     way = replace(way, rate=way.rate - fit.skew)
     best = best_of(search.ways(way, rate_sd=_RATE_STEP)) or best
+    fit = best[2]
+    if not search.has_repeats and as_read.misfit - fit.misfit < _EARN * fit.residual_sd**2:
+        return None
     logger.info(
         "the inertial sensor samples by its own clock, %.0f ppm slow; %d samples were not read",
         best[0].rate * 1e6,

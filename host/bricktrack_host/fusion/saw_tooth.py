@@ -26,11 +26,11 @@ _CAP = 9.0  # what one rotation can say: an outlier does not choose the clock
 _READ_JITTER_S = 1.5e-4  # of a stamp against the instant at which the sensor answered
 _MISSED_REPEAT = 30.0  # a sample that must have been read twice and was not
 _REPEAT_CAP = 20.0
+_MOST_REACH = 150  # samples
 _MANY_REPEATS = 0.1
 _KINK_WINDOW = 51
 _KINK_CAP = 60.0  # what one sample can say
 _KINK_TELLS = 150.0  # impacts are kinks too: how large one is says no more
-_KINK_ENTICES = 8.0  # so that a clock with more slips does not earn by more impacts
 _UNSEEN_SKIP = 10.0
 _FORBIDDEN = 400.0
 _PHASE_STEP_S = 5e-5
@@ -194,7 +194,7 @@ class SawToothSearch:
         for rate in np.arange(-n, n + 1) * step:
             age = self._age_s(self._bin_s, rate, phases[:, None])
             cost = self._optics(age[:, None] + lags[:, None])
-            cost += self._slip_cost(rate, phases, STEP_S, entices=_KINK_ENTICES)[:, None]
+            cost += self._slip_cost(rate, phases, STEP_S, entices=0.0)[:, None]
             i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
             if cost[i, j] < best.cost:
                 best = SawTooth(float(rate), float(phases[i]), float(lags[j]), float(cost[i, j]), 0.0)
@@ -247,21 +247,13 @@ class SawToothSearch:
             out.append(SawTooth(*map(float, values)))
         return out
 
-    def _slips_s(self, rate: float, phase_s: float) -> FloatArray:
-        """Return when the age of punctual reads comes to a period (a fast sensor) or to none (a slow one)."""
-        if abs(rate) < 1e-6:
-            return np.empty(0)
-        every_s = self.period_s * (1 + rate) / rate
-        first = self._mid_s + phase_s / rate
-        ends = np.sort((self._read_s[[0, -1]] - first) / every_s)
-        return np.asarray(first + np.arange(np.ceil(ends[0]), np.floor(ends[1]) + 1) * every_s)
-
     def _slip_cost(
         self, rate: float, phases_s: FloatArray, age_sd_s: float, *, entices: float
     ) -> FloatArray:
         """Return what the slips of phases cost: a sample read twice, or left out, near to each of them.
 
-        ``age_sd_s`` is how unsure the ages are. A kink where one is needed earns no more than ``entices``.
+        ``age_sd_s`` is how unsure the ages are. A kink where one is needed earns no more than ``entices``: from
+        afar nothing, or a clock with more slips would earn by more impacts.
         """
         fresh = np.flatnonzero(self._fresh)
         slot = self._slot[fresh]
@@ -272,15 +264,23 @@ class SawToothSearch:
             # A read that was late is spaced wrongly for reasons of its own.
             gain = np.maximum(self._kink_gain, -entices)
             price = np.where(np.diff(slot, append=slot[-1]) == 1, gain, 0.0)
-        sd_s = age_sd_s / max(abs(rate), 1e-5) + self.period_s
-        out = np.zeros(len(phases_s))
-        for i, phase in enumerate(phases_s):
-            slips = self._slips_s(rate, float(phase))
-            lo, hi = np.searchsorted(at_s, slips - 3 * sd_s), np.searchsorted(at_s, slips + 3 * sd_s)
-            for slip, a, b in zip(slips, lo, hi, strict=True):
-                if b > a:
-                    out[i] += (price[a:b] + ((at_s[a:b] - slip) / sd_s) ** 2).min()
-        return out
+        if abs(rate) < 1e-6:
+            return np.zeros(len(phases_s))
+        # The least price about each sample, rising with the distance.
+        sd = age_sd_s / abs(rate) / self.period_s + 1.0
+        reach = int(min(3 * sd, _MOST_REACH))
+        padded = np.pad(price, reach, constant_values=np.inf)
+        near = np.full(len(price), np.inf)
+        for k in range(2 * reach + 1):
+            near = np.minimum(near, padded[k : k + len(price)] + ((k - reach) / sd) ** 2)
+        every_s = self.period_s * (1 + rate) / rate
+        first = self._mid_s + phases_s / rate
+        ends = np.sort((self._read_s[[0, -1]] - self._mid_s) / every_s)
+        k_slip = np.arange(np.floor(ends[0]) - 1, np.ceil(ends[1]) + 2)
+        slips = first[:, None] + k_slip * every_s
+        inside = (slips > at_s[0]) & (slips < at_s[-1])
+        at = np.clip(np.searchsorted(at_s, slips), 0, len(at_s) - 1)
+        return np.asarray(np.where(inside, near[at], 0.0).sum(axis=1))
 
     def _repeat_cost(self, rate: float, phases_s: FloatArray) -> FloatArray:
         """Return what reads that found, or did not find, the sample before say of phases.

@@ -191,7 +191,7 @@ def align_times(
     best = fits[0]
     own = None
     if not _is_restamped:
-        own = find_sample_clock(t_s, R, sd_rad, signal, imu, offset_s=best.offset_s)
+        own = find_sample_clock(t_s, R, sd_rad, signal, imu, as_read=best)
     if own is not None:
         found = align_times(
             optical,
