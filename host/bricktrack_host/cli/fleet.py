@@ -81,7 +81,8 @@ def _print_table(units: list[UnitConfig], answers: list[StatusReply | Bricktrack
         ("edges", "right"), ("line", "left"), ("imus", "left"), ("temp", "right"), ("health", "left"),
         ("note", "left"),
     ):  # fmt: skip
-        table.add_column(name, justify="right" if justify == "right" else "left")
+        right = justify == "right"
+        table.add_column(name, justify="right" if right else "left", no_wrap=name == "state")
     for unit, answer in zip(units, answers, strict=True):
         if isinstance(answer, BricktrackError):
             table.add_row(unit.name, "[red]no answer[/]", *[""] * 9)
