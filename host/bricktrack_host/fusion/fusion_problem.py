@@ -240,8 +240,9 @@ def noise_parts(
         return np.interp(t_s + shift_s, signal.t_s, values)
 
     gap = np.where(signal.in_gap(t_s), hold, 0.0)
-    gyro_fixed = s.gyro_noise_radps**2 + (s.impact_share * signal.gyro_impact_radps) ** 2
-    acc_fixed = s.acc_noise_mps2**2 + (s.impact_share * signal.acc_impact_mps2) ** 2 + signal.clip_sd_mps2**2
+    gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
+    shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
+    acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2
     gyro_rough = np.maximum(signal.gyro_roughness_radps**2 - s.gyro_noise_radps**2, 0.0)
     acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
     acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2

@@ -21,9 +21,13 @@ class FusionSettings:
     roughness_share : float
         Error of a sample, as white noise, over the steady roughness of the samples: 1 for noise. A vibration
         at one pitch integrates to far less: see `adapt_noise`.
-    impact_share : float
+    gyro_impact_share, acc_impact_share : float
         Error of the three samples about a pulse over its height. A pulse of a few ms seen at 100 Hz may be
-        hit at its peak or at its foot, so the velocity change is unsure by nearly all of height times 10 ms.
+        hit at its peak or at its foot, so the velocity change is unsure by more than height times 10 ms. The
+        angular rate only steps at an impact.
+    impact_arm_mm : float
+        What turns the brick also shoves it, were it missed by the accelerometer: change of velocity over
+        change of angular rate.
     adapt_noise : bool
         Whether each run chooses its share of roughness and its multiple of the systematic errors by the
         likelihood of its frames.
@@ -59,7 +63,9 @@ class FusionSettings:
     lever_arm_sd_mm: float = 1.0
     systematic_time_s: float = 0.1
     roughness_share: float = 1.0
-    impact_share: float = 0.5
+    gyro_impact_share: float = 0.3
+    acc_impact_share: float = 1.0
+    impact_arm_mm: float = 100.0
     adapt_noise: bool = True
     gyro_bias_walk_radps: float = 3e-4
     acc_bias_walk_mps2: float = 0.01

@@ -22,8 +22,8 @@ MIN_SAMPLES = 20
 _GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
 _BRIDGE_PERIODS = 3.5  # up to here the cubic may bridge it; beyond, a straight line
 _SUBSTEPS = 4  # of at most 2.5 ms at 100 Hz: cubic signal, exact integrals, coning left below 1e-8 rad
-# sd of (sample - polynomial through n neighbours on each side) over sd of one sample of white noise
-_PREDICTION_GAIN = {n: comb(4 * n, 2 * n) ** 0.5 / comb(2 * n, n) for n in (2, 4)}
+# sd of (sample - polynomial through eight neighbours) over sd of one sample, white noise
+_PREDICTION_GAIN = comb(16, 8) ** 0.5 / comb(8, 4)
 _STEADY_SAMPLES = 25
 _IMPACT_SIGMA = 5.0
 _CLIP_SHARE = 0.98  # of the range: filters inside the chip round a clipped peak off a little
@@ -80,16 +80,17 @@ def roughness(values: FloatArray) -> tuple[FloatArray, FloatArray]:
         greatest of the axes. A motion of a fifth of the sample rate gives 3 % of its amplitude, about what
         the spline loses of it.
     impact : ndarray, shape (n,), unit of ``values``
-        Height of a pulse over the cubic through four neighbours where it stands out of what is usual there,
-        at its sample and the two beside it; else 0.
+        Height of a pulse over the same polynomial, where it stands out of what is usual there, at its sample
+        and the two beside it; else 0.
     """
     v = as_float_array("values", values, (None, 3))
-    steady = _usual(_off_neighbours(v, 4)) / _PREDICTION_GAIN[4]
-    off = _off_neighbours(v, 2)
-    # A pulse pulls its neighbours' cubics as well: only the peak counts.
-    peak = off >= 0.7 * maximum_filter1d(off, 5, axis=0, mode="nearest")
-    impact = np.where(peak & (off > _IMPACT_SIGMA * _usual(off)), off, 0.0).max(axis=1)
-    return np.asarray(steady.max(axis=1)), np.asarray(maximum_filter1d(impact, 3, mode="nearest"))
+    off = _off_neighbours(v, 4)
+    usual = _usual(off)
+    # A pulse pulls its neighbours' polynomials as well: only the peak counts.
+    peak = off >= 0.9 * maximum_filter1d(off, 9, axis=0, mode="nearest")
+    impact = np.where(peak & (off > _IMPACT_SIGMA * usual), off, 0.0).max(axis=1)
+    steady = usual.max(axis=1) / _PREDICTION_GAIN
+    return np.asarray(steady), np.asarray(maximum_filter1d(impact, 3, mode="nearest"))
 
 
 def _off_neighbours(values: FloatArray, n_side: int) -> FloatArray:
