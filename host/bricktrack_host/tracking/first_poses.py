@@ -153,15 +153,20 @@ def _poses_from_three(
             uv[of[rows]], cov[of[rows]], R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=steps
         )
 
-    tries = fit(np.arange(len(of)), R, t, _QUICK_STEPS)
-    # Most are on their way to the pose that the frame has already: that one need not be found again.
+    # Most tries end at the pose that the frame has already: where a fifth LED tells twins apart, those on
+    # their way to it go no further. With four LEDs tries are followed to the end, along whatever valley.
+    enough = (seen.sum(axis=1) > MIN_LEDS)[of]
+    quick, slow = np.flatnonzero(enough), np.flatnonzero(~enough)
+    tries = fit(np.arange(len(of)), np.where(enough[:, None, None], R, np.nan), t, _QUICK_STEPS)
     turned = np.linalg.norm(rvec_from_matrix(np.swapaxes(own_R, -1, -2) @ tries.R_camera_brick), axis=1)
     apart_mm = np.linalg.norm(own_t - tries.t_camera_brick_mm, axis=1)
-    same = (turned < 0.5 * _SAME_POSE_RAD) & (apart_mm < _SAME_PLACE_MM)
-    rows = np.flatnonzero(~same & np.isfinite(tries.chi2))
+    same = enough & (turned < 0.5 * _SAME_POSE_RAD) & (apart_mm < _SAME_PLACE_MM)
+    rows = quick[(~same & np.isfinite(tries.chi2))[quick]]
     if rows.size:
         again = fit(rows, tries.R_camera_brick[rows], tries.t_camera_brick_mm[rows], _STEPS - _QUICK_STEPS)
         tries = tries.replaced(rows, again)
+    if slow.size:
+        tries = tries.replaced(slow, fit(slow, R[slow], t[slow], _STEPS))
     facing = np.where(same[:, None], poses.facing[frames[of]], tries.facing)
     chi2 = np.where(same, poses.chi2[frames[of]], tries.chi2)
     visible = np.where(seen[of], facing > 0, True).all(axis=1)

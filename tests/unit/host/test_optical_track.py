@@ -8,7 +8,7 @@ from bricktrack_common.brick_model import LayoutFile, LedEntry, ProfileEntry, br
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.tracking.led_profile import predict_brick
-from bricktrack_host.tracking.optical_track import led_motion, led_times_ns, solve_poses
+from bricktrack_host.tracking.optical_track import led_motion, led_times_ns, solve_poses, start_poses
 from bricktrack_host.tracks import FusedTrack, LedObservations
 
 CAMERA = PinholeCamera()
@@ -114,9 +114,10 @@ def test_every_frame_with_five_leds_has_its_true_pose(hidden):
     assert (track.flags[~posed] & PoseFlag.AMBIGUOUS).all()
 
 
-def test_two_poses_that_fit_alike_are_not_chosen_between():
-    # Four LEDs in a small square far away, one deep LED hidden: tilted to either side they look the same.
-    places = [(0.0, 0.0, 0.0), (8.0, 0.0, 0.0), (8.0, 8.0, 0.0), (0.0, 8.0, 0.0), (4.0, 4.0, -6.0)]
+@pytest.mark.parametrize("fifth", [[], [(4.0, 4.0, 0.0)]])
+def test_two_poses_that_fit_alike_are_not_chosen_between(fifth):
+    # LEDs in a small square far away, one deep LED hidden: tilted to either side they look the same.
+    places = [(0.0, 0.0, 0.0), (8.0, 0.0, 0.0), (8.0, 8.0, 0.0), (0.0, 8.0, 0.0), *fifth, (4.0, 4.0, -6.0)]
     leds = [
         LedEntry(name=f"s{i}", position_mm=p, axis=(0, 0, -1.0), radius_mm=0.5) for i, p in enumerate(places)
     ]
@@ -128,7 +129,7 @@ def test_two_poses_that_fit_alike_are_not_chosen_between():
     uv = prediction.uv_px.copy()
     whole = solve_poses(observations(uv, sd=0.3), CAMERA, brick)
     np.testing.assert_allclose(whole.t_camera_brick_mm, t, atol=1e-3)
-    uv[:, 4] = np.nan
+    uv[:, -1] = np.nan
     track = solve_poses(observations(uv, sd=0.3), CAMERA, brick)
     assert track.flags[0] & PoseFlag.AMBIGUOUS
     assert np.isnan(track.t_camera_brick_mm).all()
@@ -236,6 +237,20 @@ def test_a_motion_that_is_known_otherwise_takes_the_place_of_splines():
     known = solve_poses(seen, CAMERA, BRICK, motion=motion)
     # Six frames are few for a spline; the true motion leaves the profile's and the lens terms' micrometres.
     np.testing.assert_allclose(known.t_camera_brick_mm, t, atol=0.01)
+
+
+def test_first_poses_had_once_serve_every_motion():
+    uv, _, _ = rolling_pixels(12)
+    uv[4:7, 2] = np.nan
+    seen = observations(uv)
+    t_ns, led_t_ns = led_times_ns(seen, CAMERA)
+    first = start_poses(seen, CAMERA, BRICK)
+    for motion in (None, led_motion(track_at(t_ns), track_at(led_t_ns.ravel()))):
+        anew = solve_poses(seen, CAMERA, BRICK, motion=motion)
+        again = solve_poses(seen, CAMERA, BRICK, motion=motion, first=first)
+        np.testing.assert_array_equal(again.t_camera_brick_mm, anew.t_camera_brick_mm)
+        np.testing.assert_array_equal(again.covariance, anew.covariance)
+        np.testing.assert_array_equal(again.flags, anew.flags)
 
 
 def test_an_impact_that_no_spline_follows_is_corrected_by_the_frames_own_rows():
