@@ -33,6 +33,7 @@ from bricktrack_host.calibration.calibration_file import (
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
+from bricktrack_host.quality import PoseFlag
 from bricktrack_host.recordings.video_frames import decode_run_video
 from bricktrack_host.reporting.plots import CalibrationPicture, FrameOverlay
 from bricktrack_host.reporting.report import ReportExtras, write_report
@@ -49,6 +50,7 @@ from bricktrack_host.results.result_store import (
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.results.true_motion import read_true_motion
 from bricktrack_host.results.truth import TruthComparison, compare_with_truth
+from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.first_poses import FirstPoses
 from bricktrack_host.tracking.optical_track import (
     SegmentMethod,
@@ -314,10 +316,18 @@ class _Pictures:
 
 
 def _require_poses(optical: OpticalTrack, run: Run, brick: BrickModel) -> None:
-    if not np.isfinite(optical.t_camera_brick_mm).all(axis=1).any():
+    """Refuse a run without a pose, or without one that five LEDs agree on: four fit many a wrong layout."""
+    posed = all_finite(optical.t_camera_brick_mm)
+    n = len(optical.t_ns)
+    if not posed.any():
         raise TrackingError(
-            f"{run.folder.name}: none of {len(optical.t_ns)} frames gave a pose. Look at a picture: "
+            f"{run.folder.name}: none of {n} frames gave a pose. Look at a picture: "
             f"are at least 5 of the {brick.n_leds} LEDs lit, sharp and inside it, and is this their layout?"
+        )
+    if (optical.flags[posed] & PoseFlag.UNVERIFIED != 0).all():
+        raise TrackingError(
+            f"{run.folder.name}: in none of {n} frames do five or more LEDs agree on a pose, and four "
+            f"fit many a wrong layout: no pose is believed. Is this the layout of these LEDs?"
         )
 
 

@@ -205,7 +205,7 @@ def _stretched(line: re.Match[str]) -> str:
 def test_a_layout_of_another_brick_gives_no_pose_but_words(bench, copy, tmp_path):
     layout = tmp_path / "layout.toml"
     layout.write_text(re.sub(r"position_mm = .*", _stretched, LAYOUT.read_text()))
-    with pytest.raises(TrackingError, match="none of 48 frames gave a pose"):
+    with pytest.raises(TrackingError, match=r"none of 48 frames (gave a pose|do five)"):
         process_run(copy, calibration=bench / "calibration.json", layout=layout)
 
 
