@@ -61,12 +61,18 @@ class SquareWave:
         self._drive(False, monotonic_ns())
 
     def _run(self, stop: threading.Event) -> None:
+        heard_since_ns: int | None = None
         for high, stamp_ns in self._changes():
             while not self._is_heard() and monotonic_ns() <= stamp_ns:
                 if stop.wait(_UNHEARD_WAIT_S):
                     return
             if not self._is_heard():
+                heard_since_ns = None
                 continue  # over before anybody listened
+            if heard_since_ns is None:
+                heard_since_ns = monotonic_ns()
+            if stamp_ns < heard_since_ns - _LINE_DELAY_NS:
+                continue  # likewise, if only just
             left_s = (stamp_ns + _LINE_DELAY_NS - monotonic_ns()) * 1e-9
             if (left_s > 0 and stop.wait(left_s)) or stop.is_set():
                 return

@@ -41,8 +41,8 @@ def initialisation_ms(window_ms: float, n_frames: int, period_ms: float) -> floa
 
     Examples
     --------
-    >>> initialisation_ms(1000.0, 22, 1000 / 30)
-    283.3333333333333
+    >>> round(initialisation_ms(1000.0, 22, 1000 / 30), 9)
+    283.333333333
     """
     return window_ms - (n_frames - 0.5) * period_ms
 
