@@ -20,7 +20,6 @@ from bricktrack_host.fusion.fusion_problem import (
     Linearisation,
     Nodes,
     NoiseLevel,
-    NoiseParts,
     Run,
     build_problem,
     first_linearisation,
@@ -28,6 +27,7 @@ from bricktrack_host.fusion.fusion_problem import (
 )
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import chain_rotations
+from bricktrack_host.fusion.noise_choice import frame_chi2, settle_noise
 from bricktrack_host.fusion.smoother import (
     BA,
     BG,
@@ -40,8 +40,6 @@ from bricktrack_host.fusion.smoother import (
     VEL,
     Estimate,
     Filter,
-    Problem,
-    residuals,
 )
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
@@ -51,11 +49,6 @@ logger = logging.getLogger(__name__)
 _RUNS_AT_ONCE = 8  # 2000 nodes of four 21 x 21 matrices take 28 MB a run
 _FIRST_FRAMES = 15
 _FIRST_WITHIN_RAD = 0.3
-_LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
-_EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
-_MAX_SCALE_ROUNDS = 4
-_SCALE_STANDS = 1.25
-_CHI_3_MEDIAN = 1.538  # median of the root of chi-square with 3 degrees of freedom
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +82,8 @@ class FusionResult:
     gyro_noise, acc_noise : NoiseLevel
         How much the samples were believed.
     rotation_noise_scale, position_noise_scale : float
-        What the stated optical sd had to be multiplied by, at least 1.
+        What the stated optical sd had to be multiplied by. Below 1 where frames agree better than stated: the
+        rest of the stated variance is an error that they share, and stays in the covariance given out.
     """
 
     track: FusedTrack
@@ -266,99 +260,6 @@ def _relinearise(estimate: Estimate, b: int, n_nodes: int, settings: FusionSetti
     )
 
 
-def _frame_chi2(
-    problem: Problem, passed: Filter, estimate: Estimate, b: int, nodes: Nodes, used: BoolArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how far each frame lies from what all the others say: rotation and position (3), and both (6).
-
-    The smoothed state holds the frame itself. Taken out of it again: with A = H P H', r the residual and R
-    the covariance that the filter gave the frame, the others alone leave R (R - A)^-1 r, and know the frame
-    to A + A (R - A)^-1 A.
-    """
-    at = nodes.node_of_frame
-    r, H = residuals(problem, estimate.state, at, b)
-    A = H @ estimate.covariance[at, b] @ np.swapaxes(H, -1, -2)
-    stated = problem.cov_seen[at, b]
-    given = stated * passed.inflation[at, b][:, None, None]
-    # A frame that alone fixes the state leaves no residual, and R - A near zero: judge it by a share of R.
-    rest = np.linalg.inv(1.02 * given - A)
-    out = used[:, None, None]
-    S = stated + np.where(out, A + A @ rest @ A, A)
-    r = np.where(used[:, None], (given @ rest @ r[..., None])[..., 0], r)
-
-    def chi2(part: slice) -> FloatArray:
-        e = r[:, part]
-        return np.asarray((e * np.linalg.solve(S[:, part, part], e[..., None])[..., 0]).sum(axis=1))
-
-    return chi2(slice(0, 3)), chi2(slice(3, 6)), chi2(slice(0, 6))
-
-
-def _settle_noise(
-    runs: list[Run],
-    nodes: list[Nodes],
-    lins: list[Linearisation],
-    used: list[BoolArray],
-    settings: FusionSettings,
-) -> tuple[list[FloatArray], list[tuple[NoiseLevel, NoiseLevel]], Estimate, list[FloatArray]]:
-    """Return the optical noise scales and inertial noise levels of each run, and the pass made with them.
-
-    Optical noise understated by much lets the smoother follow the frames and hides itself, so the scale is
-    taken again until it stands; when it does at once, as it should, this is one pass.
-
-    Returns
-    -------
-    scales, levels, estimate, chi2
-    """
-    stated = NoiseLevel(settings.roughness_share, 1.0)
-    levels = [(stated, stated) for _ in runs]
-    scales = [np.ones(2) for _ in runs]
-    for _ in range(_MAX_SCALE_ROUNDS):
-        problem, parts = build_problem(
-            runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
-        )
-        if settings.adapt_noise:
-            levels = _choose_noise(problem, parts, settings)
-            problem, parts = build_problem(
-                runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
-            )
-        passed = Filter(problem)
-        estimate = passed.smooth()
-        chi2s = [_frame_chi2(problem, passed, estimate, b, nodes[b], used[b]) for b in range(len(runs))]
-        more = [np.sqrt([np.median(turn), np.median(shift)]) / _CHI_3_MEDIAN for turn, shift, _ in chi2s]
-        scales = [np.maximum(scale * m, 1.0) for scale, m in zip(scales, more, strict=True)]
-        if max(float(m.max()) for m in more) < _SCALE_STANDS:
-            break
-    # By the scales that have just been refined, not those the pass was made with.
-    both = [c[2] / max(float(m.max()), 1.0) ** 2 for c, m in zip(chi2s, more, strict=True)]
-    return scales, levels, estimate, both
-
-
-def _choose_noise(
-    problem: Problem, parts: list[NoiseParts], settings: FusionSettings
-) -> list[tuple[NoiseLevel, NoiseLevel]]:
-    """Return the noise levels of gyro and accelerometer under which each run's frames are likeliest.
-
-    The roughness of the accelerometer may count for less than stated, the systematic errors of both sensors
-    for more: all choices of all runs as one batch. The stated level stands unless another earns its price.
-    """
-    steps = [(i, j) for i in (0, -1, -2) for j in (0, -1, -2, 1, 2)]
-    price = np.array([_EARN_PER_STEP * (abs(i) + abs(j)) for i, j in steps])
-    share = settings.roughness_share
-    levels = [
-        (NoiseLevel(share, _LEVEL_STEP**j), NoiseLevel(share * _LEVEL_STEP**i, _LEVEL_STEP**j))
-        for i, j in steps
-    ]
-    gyro = np.repeat(problem.gyro_var[..., None], len(levels), axis=2)
-    acc = np.repeat(problem.acc_var[..., None], len(levels), axis=2)
-    for b, part in enumerate(parts):
-        for i, (of_gyro, of_acc) in enumerate(levels):
-            gyro[: len(part.gyro_fixed), b, i] = part.gyro(of_gyro)
-            acc[: len(part.acc_fixed), b, i] = part.acc(of_acc)
-    likelihood = Filter(problem.with_noise_choices(gyro, acc), keep=False).log_likelihood
-    best = np.argmax(likelihood.reshape(len(parts), len(levels)) - price, axis=1)
-    return [levels[i] for i in best]
-
-
 def _fuse_together(
     inputs: Sequence[FusionInput], settings: FusionSettings, with_forward: bool
 ) -> list[FusionResult]:
@@ -368,28 +269,29 @@ def _fuse_together(
     starts = [_attitude_at_first_node(*three) for three in zip(runs, nodes, lins, strict=True)]
     lins = [replace(lin, R_first=R) for lin, (R, _) in zip(lins, starts, strict=True)]
     used = [agrees for _, agrees in starts]
-    scales, levels, estimate, chi2 = _settle_noise(runs, nodes, lins, used, settings)
-    for b, far in enumerate(chi2):
+    first = settle_noise(runs, lins, nodes, used, settings)
+    scales, levels = first.scales, first.levels
+    for b, far in enumerate(first.chi2):
         good = far < settings.gate_chi2
         used[b] = good if good.mean() > 0.5 else used[b]  # else it is not the frames that are wrong
     # Relinearised once, with what the first pass found of clocks, noise and outliers.
-    lins = [_relinearise(estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
-    runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(runs, lins, strict=True)]
+    lins = [_relinearise(first.estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
+    runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(first.runs, lins, strict=True)]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
     problem, _ = build_problem(
         runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
     )
     passed = Filter(problem)
     estimate = passed.smooth()
-    chi2 = [_frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
+    chi2 = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
     forward = passed.forward() if with_forward else None
     results = []
     for b, (item, run, node, lin) in enumerate(zip(inputs, runs, nodes, lins, strict=True)):
         n = len(node.t_s)
         x, P = estimate.state.x[:n, b], estimate.covariance[:n, b]
         n_frames = len(item.optical.t_ns)
-        frame_chi2, rejected = np.full(n_frames, np.nan), np.zeros(n_frames, dtype=np.bool_)
-        frame_chi2[run.frame], rejected[run.frame] = chi2[b], ~used[b]
+        chi2_of_frame, rejected = np.full(n_frames, np.nan), np.zeros(n_frames, dtype=np.bool_)
+        chi2_of_frame[run.frame], rejected[run.frame] = chi2[b], ~used[b]
         if rejected.any():
             logger.warning("%d of %d optical poses left out as outliers", rejected.sum(), len(run.frame))
 
@@ -405,7 +307,8 @@ def _fuse_together(
         ) -> FusedTrack:
             return sample_motion(
                 run, node, lin, problem, e, b,
-                output_t_ns=item.output_t_ns, used=used[b], settings=settings, is_smoothed=is_smoothed,
+                output_t_ns=item.output_t_ns, used=used[b], scale=scales[b], settings=settings,
+                is_smoothed=is_smoothed,
             )  # fmt: skip
 
         sd = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2).mean(axis=0), 0.0))
@@ -428,7 +331,7 @@ def _fuse_together(
                 acc_bias_sd_mps2=sd[BA],
                 gravity_camera_mps2=x[0, GRAV],
                 gravity_sd_mps2=sd[GRAV],
-                frame_chi2=frame_chi2,
+                frame_chi2=chi2_of_frame,
                 frame_rejected=rejected,
                 mean_nis=float(np.nanmean(passed.nis[:, b])),
                 gyro_noise=levels[b][0],

@@ -35,6 +35,7 @@ def sample_motion(
     *,
     output_t_ns: IntArray,
     used: BoolArray,
+    scale: FloatArray,
     settings: FusionSettings,
     is_smoothed: bool,
 ) -> FusedTrack:
@@ -90,8 +91,7 @@ def sample_motion(
     R_out, p_out, H = observe(state, omega, run.lever_arm_m, t_cam - run.t_mid_s, zero)
     P = H @ cov @ np.swapaxes(H, 1, 2)
     _add_bridge(P, problem, k, b, dt, nodes, is_smoothed=is_smoothed)
-    # Errors that the frames have in common: the median frame stands for all.
-    P = P + settings.optical_common_share**2 * np.median(problem.cov_seen[nodes.node_of_frame, b], axis=0)
+    P = P + _common_part(problem.cov_seen[nodes.node_of_frame, b], scale, settings.optical_common_share)
     v_out = v - np.einsum("nij,nj->ni", R_t, np.cross(omega, run.lever_arm_m))
 
     P = 0.5 * (P + np.swapaxes(P, 1, 2))
@@ -118,6 +118,22 @@ def sample_motion(
         covariance=P,
         flags=flags,
     )
+
+
+def _common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> FloatArray:
+    """Return the covariance of errors that the frames have in common; the median frame stands for all.
+
+    At least the share that is stated; more where the frames agree with each other better than their
+    covariance allows, for then it holds what they share.
+
+    Parameters
+    ----------
+    cov_seen : ndarray, shape (n_frames, 6, 6)
+        As stated, times ``scale``.
+    scale : ndarray, shape (2,)
+    """
+    share_at = np.repeat(np.sqrt(np.maximum(share**2, np.maximum(scale**-2.0 - 1.0, 0.0))), 3)
+    return np.asarray(share_at[:, None] * np.median(cov_seen, axis=0) * share_at)
 
 
 def _add_bridge(

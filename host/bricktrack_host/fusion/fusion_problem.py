@@ -26,6 +26,7 @@ from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, TimeAlign
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _MIN_POSITION_SD_M = 2e-6  # a covariance below this is not believed
+_ONE_MISSING = 2.5  # periods between samples above which more than one is missing
 _SAME_NODE_S = 2e-4  # grid nodes this near to a frame are left out
 
 
@@ -186,8 +187,8 @@ class NoiseParts:
     Attributes
     ----------
     gyro_fixed, acc_fixed
-        White noise of the samples, impacts, clipping, and gaps, where the signal is only bridged and its
-        whole spread is the error.
+        White noise of the samples, impacts, clipping, a sample bridged, and gaps, where the whole spread of
+        the signal is the error.
     gyro_rough, acc_rough
         Steady roughness beyond the sensor's own noise, at a share of 1.
     gyro_systematic, acc_systematic
@@ -239,7 +240,8 @@ def noise_parts(
     def at(values: FloatArray, shift_s: float) -> FloatArray:
         return np.interp(t_s + shift_s, signal.t_s, values)
 
-    gap = np.where(signal.in_gap(t_s), hold, 0.0)
+    gap = np.where(signal.in_gap(t_s, least_periods=_ONE_MISSING), hold, 0.0)
+    bridged = np.where(signal.in_gap(t_s), period, 0.0)
     gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
     shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
     acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2
@@ -247,10 +249,14 @@ def noise_parts(
     acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
     acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2
     return NoiseParts(
-        gyro_fixed=at(gyro_fixed * period, 0.0) + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2,
+        gyro_fixed=at(gyro_fixed * period, 0.0)
+        + bridged * at(signal.gyro_bridge_radps, 0.0) ** 2
+        + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2,
         gyro_rough=at(gyro_rough * period, 0.0),
         gyro_systematic=at((s.gyro_scale_sd * size) ** 2 * hold, 0.0),
-        acc_fixed=at(acc_fixed * period, lin.lag_s) + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2,
+        acc_fixed=at(acc_fixed * period, lin.lag_s)
+        + bridged * at(signal.acc_bridge_mps2, lin.lag_s) ** 2
+        + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2,
         acc_rough=at(acc_rough * period, lin.lag_s),
         acc_systematic=at(acc_systematic * hold, lin.lag_s),
     )

@@ -166,6 +166,8 @@ class ImuSignal:
         The steady part, see `roughness`.
     gyro_impact_radps, acc_impact_mps2 : ndarray, shape (n,)
         The pulses, see there.
+    gyro_bridge_radps, acc_bridge_mps2 : ndarray, shape (n,)
+        Error of the cubic where one sample is missing.
     clip_sd_mps2 : ndarray, shape (n,)
         Above zero where a sample was clipped or stands beside one.
     gaps_s : ndarray, shape (n_gaps, 2)
@@ -181,6 +183,8 @@ class ImuSignal:
     acc_roughness_mps2: FloatArray
     gyro_impact_radps: FloatArray
     acc_impact_mps2: FloatArray
+    gyro_bridge_radps: FloatArray
+    acc_bridge_mps2: FloatArray
     clip_sd_mps2: FloatArray
     gaps_s: FloatArray
     _gyro: CubicSpline[Any]
@@ -222,8 +226,10 @@ class ImuSignal:
         period_s = float(np.median(np.diff(t_s)))
         clip_limit = imu.acc_range_mps2 if imu.acc_range_mps2 > 0 else np.inf
         acc, clip_sd = _bridge_clipped(t_s, imu.acc_mps2[use], clip_limit)
-        acc = sharpened(t_s, acc, acc_filter_s)
-        gyro = sharpened(t_s, imu.gyro_radps[use], gyro_filter_s)
+        gyro = imu.gyro_radps[use]
+        # Steady roughness before sharpening: what that adds to noise lies high, and is gone once integrated.
+        gyro_steady, acc_steady = roughness(gyro)[0], roughness(acc)[0]
+        gyro, acc = sharpened(t_s, gyro, gyro_filter_s), sharpened(t_s, acc, acc_filter_s)
 
         interval = np.diff(t_s)
         missing = np.flatnonzero(interval > _GAP_PERIODS * period_s)
@@ -235,7 +241,6 @@ class ImuSignal:
             knots = np.insert(knots, i + 1, t_s[i] + share[:, 0] * interval[i])
             knot_gyro = np.insert(knot_gyro, i + 1, gyro[i] + share * (gyro[i + 1] - gyro[i]), axis=0)
             knot_acc = np.insert(knot_acc, i + 1, acc[i] + share * (acc[i + 1] - acc[i]), axis=0)
-        (gyro_steady, gyro_impact), (acc_steady, acc_impact) = roughness(gyro), roughness(acc)
         gyro_spline, acc_spline = CubicSpline(knots, knot_gyro), CubicSpline(knots, knot_acc)
         return cls(
             epoch_ns=epoch_ns,
@@ -245,8 +250,10 @@ class ImuSignal:
             acc_mps2=acc,
             gyro_roughness_radps=gyro_steady,
             acc_roughness_mps2=acc_steady,
-            gyro_impact_radps=gyro_impact,
-            acc_impact_mps2=acc_impact,
+            gyro_impact_radps=roughness(gyro)[1],
+            acc_impact_mps2=roughness(acc)[1],
+            gyro_bridge_radps=_usual(_off_neighbours(gyro, 2)).max(axis=1),
+            acc_bridge_mps2=_usual(_off_neighbours(acc, 2)).max(axis=1),
             clip_sd_mps2=clip_sd,
             gaps_s=np.stack([t_s[missing], t_s[missing + 1]], axis=1),
             _gyro=gyro_spline,
@@ -279,12 +286,13 @@ class ImuSignal:
         """Return the integral of the measured angular rate, component by component, rad."""
         return self._integral(self._gyro_integral, self._gyro, t_s)
 
-    def in_gap(self, t_s: FloatArray) -> BoolArray:
-        """Return which instants lie where samples are missing, or beyond the samples."""
+    def in_gap(self, t_s: FloatArray, *, least_periods: float = 0.0) -> BoolArray:
+        """Return which instants lie where samples are missing for so long, or beyond the samples."""
         outside = (t_s < self.t_s[0] - self.period_s) | (t_s > self.t_s[-1] + self.period_s)
-        if len(self.gaps_s):
-            i = np.searchsorted(self.gaps_s[:, 0], t_s, side="left") - 1
-            outside |= (i >= 0) & (t_s < self.gaps_s[np.maximum(i, 0), 1])
+        gaps = self.gaps_s[np.diff(self.gaps_s, axis=1)[:, 0] > least_periods * self.period_s]
+        if len(gaps):
+            i = np.searchsorted(gaps[:, 0], t_s, side="left") - 1
+            outside |= (i >= 0) & (t_s < gaps[np.maximum(i, 0), 1])
         return np.asarray(outside)
 
     def increments(

@@ -7,7 +7,6 @@ of measurement, the stamps are wrong by a saw-tooth of one period: 10 ms, 3 mm a
 """
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np

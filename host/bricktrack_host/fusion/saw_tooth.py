@@ -9,7 +9,7 @@ sample was left out and nothing else says so.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter, minimum_filter1d
+from scipy.ndimage import median_filter
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.imu_records import ImuFlag
@@ -31,12 +31,13 @@ _MANY_REPEATS = 0.1
 _KINK_WINDOW = 51
 _KINK_CAP = 60.0  # what one sample can say
 _KINK_TELLS = 150.0  # impacts are kinks too: how large one is says no more
+_KINK_IS = 20.0
 _UNSEEN_SKIP = 10.0
 _FORBIDDEN = 400.0
 _PHASE_STEP_S = 5e-5
 _APART_S = 2.5e-4
 _CONSIDERED = 60.0  # by the frame-to-frame rotations, which tell less than the attitudes
-_MAX_WAYS = 4
+_MAX_WAYS = 5
 
 _PLAIN = (-2, -1, 1, 2)
 # Two samples before a hole and two behind it: place after the last before it, and their neighbours' numbers.
@@ -194,7 +195,7 @@ class SawToothSearch:
         for rate in np.arange(-n, n + 1) * step:
             age = self._age_s(self._bin_s, rate, phases[:, None])
             cost = self._optics(age[:, None] + lags[:, None])
-            cost += self._slip_cost(rate, phases, STEP_S, entices=0.0)[:, None]
+            cost += self._slip_cost(rate, phases, STEP_S, entices=0.0)[0][:, None]
             i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
             if cost[i, j] < best.cost:
                 best = SawTooth(float(rate), float(phases[i]), float(lags[j]), float(cost[i, j]), 0.0)
@@ -226,30 +227,36 @@ class SawToothSearch:
         back -= self.period_s * np.round((back - near.lag_s) / self.period_s)
         lags = back[:, None] + np.arange(-1.0, 1.01, 0.25) * STEP_S
         rates = near.rate + rate_sd * np.linspace(-2, 2, 9)
-        costs, read_costs, lag_at = [], [], []
+        costs, read_costs, lag_at, kinks = [], [], [], []
         for rate in rates:
             age = self._age_s(self._bin_s, rate, phases[:, None])
             cost = self._optics(age[:, None] + lags[..., None])
             j = np.argmin(cost, axis=1)
             rows = np.arange(len(phases))
-            slips = self._slip_cost(rate, phases, _READ_JITTER_S, entices=_KINK_TELLS)
+            slips, where = self._slip_cost(rate, phases, _READ_JITTER_S, entices=_KINK_TELLS)
             read_costs.append(slips + self._repeat_cost(rate, phases))
+            kinks.append(where)
             costs.append(cost[rows, j] + read_costs[-1])
             lag_at.append(lags[rows, j])
         cost = np.array(costs)
-        over_rates = cost.min(axis=0)
-        lowest = minimum_filter1d(over_rates, 2 * round(_APART_S / _PHASE_STEP_S) + 1, mode="wrap")
-        found = np.flatnonzero((over_rates == lowest) & (over_rates < over_rates.min() + _CONSIDERED))
-        out = []
-        for j in found[np.argsort(over_rates[found])][:_MAX_WAYS]:
-            i = int(np.argmin(cost[:, j]))
+        out: list[SawTooth] = []
+        seen: list[tuple[int, float]] = []
+        for flat in np.argsort(cost, axis=None):
+            i, j = np.unravel_index(int(flat), cost.shape)
+            if len(out) == _MAX_WAYS or cost[i, j] > cost.min() + _CONSIDERED:
+                break
+            # Another way is one whose slips lie at other kinks, or one that is apart.
+            at = int(kinks[i][j]), float(phases[j])
+            if any(at[0] == k and abs(at[1] - p) < _APART_S for k, p in seen):
+                continue
+            seen.append(at)
             values = rates[i], phases[j], lag_at[i][j], cost[i, j], read_costs[i][j]
             out.append(SawTooth(*map(float, values)))
         return out
 
     def _slip_cost(
         self, rate: float, phases_s: FloatArray, age_sd_s: float, *, entices: float
-    ) -> FloatArray:
+    ) -> tuple[FloatArray, IntArray]:
         """Return what the slips of phases cost: a sample read twice, or left out, near to each of them.
 
         ``age_sd_s`` is how unsure the ages are. A kink where one is needed earns no more than ``entices``: from
@@ -265,14 +272,16 @@ class SawToothSearch:
             gain = np.maximum(self._kink_gain, -entices)
             price = np.where(np.diff(slot, append=slot[-1]) == 1, gain, 0.0)
         if abs(rate) < 1e-6:
-            return np.zeros(len(phases_s))
+            return np.zeros(len(phases_s)), np.zeros(len(phases_s), dtype=np.int64)
         # The least price about each sample, rising with the distance.
         sd = age_sd_s / abs(rate) / self.period_s + 1.0
         reach = int(min(3 * sd, _MOST_REACH))
         padded = np.pad(price, reach, constant_values=np.inf)
-        near = np.full(len(price), np.inf)
+        near, best = np.full(len(price), np.inf), np.zeros(len(price), dtype=np.int64)
         for k in range(2 * reach + 1):
-            near = np.minimum(near, padded[k : k + len(price)] + ((k - reach) / sd) ** 2)
+            here = padded[k : k + len(price)] + ((k - reach) / sd) ** 2
+            best = np.where(here < near, np.arange(len(price)) + k - reach, best)
+            near = np.minimum(near, here)
         every_s = self.period_s * (1 + rate) / rate
         first = self._mid_s + phases_s / rate
         ends = np.sort((self._read_s[[0, -1]] - self._mid_s) / every_s)
@@ -280,7 +289,10 @@ class SawToothSearch:
         slips = first[:, None] + k_slip * every_s
         inside = (slips > at_s[0]) & (slips < at_s[-1])
         at = np.clip(np.searchsorted(at_s, slips), 0, len(at_s) - 1)
-        return np.asarray(np.where(inside, near[at], 0.0).sum(axis=1))
+        cost = np.where(inside, near[at], 0.0).sum(axis=1)
+        # One number for the kinks that are used; slips at rest have none.
+        kinks = np.where(inside & (near[at] < -_KINK_IS), best[at] + 1, 0)
+        return np.asarray(cost), np.asarray((kinks * (7919 ** (np.arange(kinks.shape[1]) % 4))).sum(axis=1))
 
     def _repeat_cost(self, rate: float, phases_s: FloatArray) -> FloatArray:
         """Return what reads that found, or did not find, the sample before say of phases.

@@ -238,6 +238,8 @@ class Filter:
         By how much the covariance of a surprising frame was enlarged.
     log_likelihood : ndarray, shape (B,)
         Of the frames given the past; what one frame can take away is bounded.
+    last : State, leading shape (B,)
+        After the last frame: of what stands still, all that the run tells.
     """
 
     def __init__(self, problem: Problem, *, keep: bool = True) -> None:
@@ -300,6 +302,7 @@ class Filter:
                 R, x, P = self._update(k, R, x, P)
             if keep:
                 self.R[k], self.x[k], self.P[k] = R, x, P
+        self.last = State(R, x)
 
     def _update(
         self, k: int, R: FloatArray, x: FloatArray, P: FloatArray

@@ -1,0 +1,158 @@
+"""How far frames and inertial samples are to be believed, found from how well they agree."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_host.fusion.fusion_problem import (
+    Linearisation,
+    Nodes,
+    NoiseLevel,
+    NoiseParts,
+    Run,
+    build_problem,
+)
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem, residuals
+
+_LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
+_EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
+_MAX_SCALE_ROUNDS = 4
+_SCALE_STANDS = 1.25
+_LEAST_SCALE = 0.3  # what frames have in common stays hidden; this much of their sd is left
+_CLEARLY_LESS = 0.7
+_CHI_3_MEDIAN = 1.538  # median of the root of chi-square with 3 degrees of freedom
+
+
+def _with_sensors(lin: Linearisation, x: FloatArray) -> Linearisation:
+    """Return a linearisation with the lag and the loss of the accelerometer from a state."""
+    return replace(lin, lag_s=float(x[LAG]), loss_s2=max(float(x[LOSS]), 0.0))
+
+
+def frame_chi2(
+    problem: Problem, passed: Filter, estimate: Estimate, b: int, nodes: Nodes, used: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how far each frame lies from what all the others say: rotation and position (3), and both (6).
+
+    The smoothed state holds the frame itself. Taken out of it again: with A = H P H', r the residual and R
+    the covariance that the filter gave the frame, the others alone leave R (R - A)^-1 r, and know the frame
+    to A + A (R - A)^-1 A.
+    """
+    at = nodes.node_of_frame
+    r, H = residuals(problem, estimate.state, at, b)
+    A = H @ estimate.covariance[at, b] @ np.swapaxes(H, -1, -2)
+    stated = problem.cov_seen[at, b]
+    given = stated * passed.inflation[at, b][:, None, None]
+    # A frame that alone fixes the state leaves no residual, and R - A near zero: judge it by a share of R.
+    rest = np.linalg.inv(1.02 * given - A)
+    out = used[:, None, None]
+    S = stated + np.where(out, A + A @ rest @ A, A)
+    r = np.where(used[:, None], (given @ rest @ r[..., None])[..., 0], r)
+
+    def chi2(part: slice) -> FloatArray:
+        e = r[:, part]
+        return np.asarray((e * np.linalg.solve(S[:, part, part], e[..., None])[..., 0]).sum(axis=1))
+
+    return chi2(slice(0, 3)), chi2(slice(3, 6)), chi2(slice(0, 6))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Settled:
+    """What the first pass over a batch found; lists hold one entry for each run.
+
+    Attributes
+    ----------
+    runs, lins, nodes : list of Run, Linearisation, Nodes
+        With the sensors as they turned out.
+    estimate : Estimate
+    scales : list of ndarray, shape (2,)
+        Of the optical sd, rotation and position: above 1 where frames agree less with each other than they
+        promise, below where more.
+    levels : list of (NoiseLevel, NoiseLevel)
+    chi2 : list of ndarray, shape (n_frames,)
+        Of each frame by all others, by the sd as scaled, but never less than stated.
+    """
+
+    runs: list[Run]
+    lins: list[Linearisation]
+    nodes: list[Nodes]
+    estimate: Estimate
+    scales: list[FloatArray]
+    levels: list[tuple[NoiseLevel, NoiseLevel]]
+    chi2: list[FloatArray]
+
+
+def settle_noise(
+    runs: list[Run],
+    lins: list[Linearisation],
+    nodes: list[Nodes],
+    used: list[BoolArray],
+    settings: FusionSettings,
+) -> Settled:
+    """Return a first pass with the noise of frames and samples, and the sensors' lags, as the run tells them.
+
+    Optical noise understated by much lets the smoother follow the frames and hides itself, so the scale is
+    taken again until it stands; when it does at once, as it should, this is one pass.
+    """
+    stated = NoiseLevel(settings.roughness_share, 1.0)
+    levels = [(stated, stated) for _ in runs]
+    scales = [np.ones(2) for _ in runs]
+    for _ in range(_MAX_SCALE_ROUNDS):
+        problem, parts = build_problem(
+            runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
+        )
+        if settings.adapt_noise:
+            levels, last = _choose_noise(problem, parts, settings)
+            # What stands still is known by now: the accelerometer is taken as it is from here on.
+            lins = [_with_sensors(lin, x) for lin, x in zip(lins, last, strict=True)]
+            runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(runs, lins, strict=True)]
+            problem, _ = build_problem(
+                runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
+            )
+        passed = Filter(problem)
+        estimate = passed.smooth()
+        chi2s = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b]) for b in range(len(runs))]
+        more = [np.sqrt([np.median(turn), np.median(shift)]) / _CHI_3_MEDIAN for turn, shift, _ in chi2s]
+        done = max(float(m.max()) for m in more) < _SCALE_STANDS
+        # By the scales that have just been refined, not those the pass was made with.
+        both = [c[2] / max(float(m.max()), 1.0) ** 2 for c, m in zip(chi2s, more, strict=True)]
+        scales = [_settled_scale(scale * m, done) for scale, m in zip(scales, more, strict=True)]
+        if done:
+            break
+    return Settled(runs, lins, nodes, estimate, scales, levels, both)
+
+
+def _settled_scale(scale: FloatArray, done: bool) -> FloatArray:
+    """Return scales of the optical sd: below 1 only in the end, and only where that is beyond doubt."""
+    less = np.maximum(scale, _LEAST_SCALE)
+    return np.where(done & (scale < _CLEARLY_LESS), less, np.maximum(scale, 1.0))
+
+
+def _choose_noise(
+    problem: Problem, parts: list[NoiseParts], settings: FusionSettings
+) -> tuple[list[tuple[NoiseLevel, NoiseLevel]], list[FloatArray]]:
+    """Return the noise levels of gyro and accelerometer under which each run's frames are likeliest.
+
+    And the last state of the filter that has them, shape (22,).
+
+    The roughness of the accelerometer may count for less than stated, the systematic errors of both sensors
+    for more: all choices of all runs as one batch. The stated level stands unless another earns its price.
+    """
+    steps = [(i, j) for i in (0, -1, -2) for j in (0, -1, -2, 1, 2)]
+    price = np.array([_EARN_PER_STEP * (abs(i) + abs(j)) for i, j in steps])
+    share = settings.roughness_share
+    levels = [
+        (NoiseLevel(share, _LEVEL_STEP**j), NoiseLevel(share * _LEVEL_STEP**i, _LEVEL_STEP**j))
+        for i, j in steps
+    ]
+    gyro = np.repeat(problem.gyro_var[..., None], len(levels), axis=2)
+    acc = np.repeat(problem.acc_var[..., None], len(levels), axis=2)
+    for b, part in enumerate(parts):
+        for i, (of_gyro, of_acc) in enumerate(levels):
+            gyro[: len(part.gyro_fixed), b, i] = part.gyro(of_gyro)
+            acc[: len(part.acc_fixed), b, i] = part.acc(of_acc)
+    passed = Filter(problem.with_noise_choices(gyro, acc), keep=False)
+    best = np.argmax(passed.log_likelihood.reshape(len(parts), len(levels)) - price, axis=1)
+    last = passed.last.x.reshape(len(parts), len(levels), -1)
+    return [levels[i] for i in best], [last[b, i] for b, i in enumerate(best)]
