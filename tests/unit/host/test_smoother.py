@@ -11,6 +11,7 @@ from bricktrack_host.fusion.smoother import (
     BG,
     GRAV,
     LAG,
+    LOSS,
     N_STATES,
     POS,
     SKEW,
@@ -43,6 +44,7 @@ def turning_problem(seed=3):
         dv_mps=(half @ force[..., None])[..., 0] * DT,
         dp_m=(half @ force[..., None])[..., 0] * DT**2 / 2,
         f_rate_mps3=rng.normal(0, 100, (*steps, 3)),
+        f_curve_mps4=rng.normal(0, 1e4, (*steps, 3)),
         gyro_var=np.zeros(steps),
         acc_var=np.zeros(steps),
         gyro_bias_walk=np.zeros(steps),
@@ -59,6 +61,7 @@ def turning_problem(seed=3):
         tau_lin=np.zeros(1),
         skew_lin=np.zeros(1),
         lag_lin=np.zeros(1),
+        loss_lin=np.zeros(1),
         start=State(Rotation.random(rng=rng).as_matrix()[None], x),
         P_start=np.eye(N_STATES)[None] * 1e-6,
     )
@@ -131,7 +134,7 @@ def straight_problem(seed):
     has_frame[[0, 4, 8, 12, 30, 34, 38], 0] = True
     P = np.zeros((N_STATES, N_STATES))
     P[ATT, ATT] = P[BG, BG] = np.eye(3) * 1e-16  # held: the problem is linear then
-    P[[TAU, SKEW, LAG], [TAU, SKEW, LAG]] = 1e-18
+    P[[TAU, SKEW, LAG, LOSS], [TAU, SKEW, LAG, LOSS]] = 1e-18
     P[POS, POS], P[VEL, VEL] = np.eye(3) * 0.1**2, np.eye(3) * 0.3**2
     P[BA, BA], P[GRAV, GRAV] = np.eye(3) * 0.2**2, np.eye(3) * 0.1**2
     acc_var = rng.uniform(0.5, 2.0, steps) * 1e-4
@@ -150,6 +153,7 @@ def straight_problem(seed):
         dv_mps=force * DT,
         dp_m=force * DT**2 / 2,
         f_rate_mps3=np.zeros((*steps, 3)),
+        f_curve_mps4=np.zeros((*steps, 3)),
         acc_var=acc_var,
         acc_bias_walk=np.full(steps, 1e-3),
         omega_radps=np.zeros((N_NODES, 1, 3)),
@@ -209,7 +213,7 @@ def test_smoother_equals_the_dense_gaussian_solution():
 
 def test_runs_of_a_batch_do_not_touch_each_other():
     a, b = straight_problem(6), straight_problem(7)
-    per_run = {"lever_arm_m", "bg_lin", "ba_lin", "tau_lin", "skew_lin", "lag_lin", "P_start"}
+    per_run = {"lever_arm_m", "bg_lin", "ba_lin", "tau_lin", "skew_lin", "lag_lin", "loss_lin", "P_start"}
     both = {
         name: np.concatenate([getattr(a, name), getattr(b, name)], axis=0 if name in per_run else 1)
         for name in Problem.__slots__
