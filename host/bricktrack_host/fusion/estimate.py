@@ -278,12 +278,21 @@ def _fuse_together(
     lins = [_relinearise(first.estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
     runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(first.runs, lins, strict=True)]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
-    problem, _ = build_problem(
-        runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
-    )
-    passed = Filter(problem)
-    estimate = passed.smooth()
-    chi2 = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
+    for is_last in (False, True):
+        problem, _ = build_problem(
+            runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
+        )
+        passed = Filter(problem)
+        estimate = passed.smooth()
+        chi2 = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
+        # The first pass knew little of the sensors and may have been wrong about a frame at an impact.
+        back = [
+            ~u & (c * min(float(scale.min()), 1.0) ** 2 < settings.gate_chi2)
+            for u, c, scale in zip(used, chi2, scales, strict=True)
+        ]
+        if is_last or not any(b.any() for b in back):
+            break
+        used = [u | b for u, b in zip(used, back, strict=True)]
     forward = passed.forward() if with_forward else None
     results = []
     for b, (item, run, node, lin) in enumerate(zip(inputs, runs, nodes, lins, strict=True)):

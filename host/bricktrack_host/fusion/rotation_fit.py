@@ -223,7 +223,8 @@ class RotationFit:
                 break
         bias, bias_covariance = self._bias(t, attitude, drift, sd * self._sd[inside])
         misfit = 3 * float(np.minimum(residual**2, _MISFIT_CAP * sd**2).sum())
-        return Fit(offset, skew, lost, self._gyro_bias + bias, np.sqrt(np.diag(bias_covariance)), covariance, sd, misfit, n)
+        bias_sd = np.sqrt(np.diag(bias_covariance))
+        return Fit(offset, skew, lost, self._gyro_bias + bias, bias_sd, covariance, sd, misfit, n)
 
     @staticmethod
     def _bias(

@@ -174,7 +174,7 @@ class SawToothSearch:
         return float(self._optics(line[:, None] + np.arange(-_SIDE_S, _SIDE_S, STEP_S)[:, None]).min())
 
     def _optics(self, lag_s: FloatArray) -> FloatArray:
-        """Return the cost of offsets from camera time to stamps, less the coarse one, at the bins (last axis)."""
+        """Return the cost of offsets from camera time to stamps, less the coarse one, at the last axis' bins."""
         column = (lag_s - self._lags_s[0]) / STEP_S
         i = np.clip(column.astype(np.int64), 0, len(self._lags_s) - 2)
         share = np.clip(column - i, 0.0, 1.0)
@@ -259,8 +259,8 @@ class SawToothSearch:
     ) -> tuple[FloatArray, IntArray]:
         """Return what the slips of phases cost: a sample read twice, or left out, near to each of them.
 
-        ``age_sd_s`` is how unsure the ages are. A kink where one is needed earns no more than ``entices``: from
-        afar nothing, or a clock with more slips would earn by more impacts.
+        ``age_sd_s`` is how unsure the ages are. A kink where one is needed earns no more than ``entices``:
+        from afar nothing, or a clock with more slips would earn by more impacts.
         """
         fresh = np.flatnonzero(self._fresh)
         slot = self._slot[fresh]
@@ -331,7 +331,8 @@ class SawToothSearch:
         total, came = price[0], np.zeros((len(number), 3), dtype=np.int64)
         for j in range(1, len(number)):
             step = number[j] - number[j - 1][:, None]  # from, to
-            way_cost = total[:, None] + np.where((step == 0) if self._is_repeat[j] else (step >= 1), 0.0, _FORBIDDEN)
+            allowed = step == 0 if self._is_repeat[j] else step >= 1
+            way_cost = total[:, None] + np.where(allowed, 0.0, _FORBIDDEN)
             if self._slot[j] - self._slot[j - 1] == 1:
                 way_cost = way_cost + np.where(step > 1, unseen[j - 1], 0.0)
             came[j] = np.argmin(way_cost, axis=0)
