@@ -174,7 +174,7 @@ class SawToothSearch:
         return float(self._optics(line[:, None] + np.arange(-_SIDE_S, _SIDE_S, STEP_S)[:, None]).min())
 
     def _optics(self, lag_s: FloatArray) -> FloatArray:
-        """Return the cost of offsets from camera time to stamps, less the coarse one, at the last axis' bins."""
+        """Return the cost of offsets from camera time to stamps, less the coarse one, along the last axis."""
         column = (lag_s - self._lags_s[0]) / STEP_S
         i = np.clip(column.astype(np.int64), 0, len(self._lags_s) - 2)
         share = np.clip(column - i, 0.0, 1.0)
