@@ -27,10 +27,23 @@ path-traced (simulated) dots of 8 to 16 px radius."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompletedDot:
-    """Centre, shape (2,), px, and covariance, shape (2, 2), px^2, of a cut dot."""
+    """A cut dot that was fitted.
+
+    Attributes
+    ----------
+    uv_px : ndarray, shape (2,), px
+        Its centre.
+    cov_px2 : ndarray, shape (2, 2), px^2
+    shape_px2 : ndarray, shape (2, 2), px^2
+        Matrix E of its ellipse d' E^-1 d = 1.
+    rms : float
+        By which light and model differ, share of the contrast.
+    """
 
     uv_px: FloatArray
     cov_px2: FloatArray
+    shape_px2: FloatArray
+    rms: float
 
 
 def complete_cut_dot(
@@ -120,4 +133,4 @@ def complete_cut_dot(
     if abs(p[2]) > MAX_SIZE_CHANGE or inside < MIN_CENTRE_INSIDE or rms > max(MAX_RMS, 2 * noise):
         return None
     cov = np.linalg.inv(normal)[:2, :2] * noise**2 + MODEL_ERROR_PX**2 * np.eye(2)
-    return CompletedDot(p[:2].copy(), cov)
+    return CompletedDot(p[:2].copy(), cov, shape_px2 * np.exp(2 * p[2]), rms)

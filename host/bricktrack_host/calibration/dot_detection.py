@@ -6,9 +6,9 @@ light does not pull the centre. It is the centroid of the *image* of the disc;
 `calibration.disc_bias` takes it to the image of the disc's centre once a lens model is at hand.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,24 +16,23 @@ from numpy.typing import NDArray
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.errors import CalibrationError, ShapeError
-from bricktrack_host.calibration.cut_dots import complete_cut_dot
+from bricktrack_host.calibration.cut_dots import CompletedDot, complete_cut_dot
+from bricktrack_host.calibration.dot_regions import (
+    MIN_AREA_PX2,
+    MIN_CONTRAST_GREY,
+    Light,
+    Regions,
+    round_regions,
+)
+from bricktrack_host.calibration.dot_sizes import LARGE_AREA_RATIO, area_ratios
 from bricktrack_host.calibration.neighbours import Neighbours, median_spacing
 
-GreyImage = NDArray[np.uint8]
+GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
+"""8 bits, or 16 bits full scale: the mean of several pictures."""
 Polarity = Literal["auto", "white-on-black", "black-on-white"]
 
-MIN_AREA_PX2 = 20.0
-"""A dot under 5 px across has no plateau, and noise looks like it."""
-MIN_FILL_OF_ELLIPSE = 0.85
-"""Least ratio of a dot's area to that of its moment ellipse's; a disc has 1, a square 0.95, a cross 0.6."""
-MAX_AXIS_RATIO = 2.0
-"""Longest to shortest axis: a target tilted by 60 degrees."""
-MIN_CONTRAST_GREY = 12.0
-"""Least step from background to plateau, grey levels."""
 MIN_NOISE_GREY = 0.29
 """What rounding to whole grey levels makes alone."""
-MIN_RELATIVE_CONTRAST = 0.15
-"""A dot must show this share of the picture's strongest contrasts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +52,10 @@ class Dots:
     is_completed : ndarray of bool, shape (n,)
         A cut dot's centre was found from its visible rim after all (`bricktrack_host.calibration.cut_dots`).
     polarity : "white-on-black" or "black-on-white"
+    blur_px : ndarray, shape (n,), px
+        Standard deviation of the rim's blur; NaN where the border cuts the dot.
+    light_grey, dark_grey : ndarray, shape (n,), grey levels of 255
+        The lighter and the darker of the dot's plateau and its surroundings.
     """
 
     uv_px: FloatArray
@@ -61,30 +64,26 @@ class Dots:
     touches_border: BoolArray
     is_completed: BoolArray
     polarity: Polarity
+    blur_px: FloatArray
+    light_grey: FloatArray
+    dark_grey: FloatArray
 
     def __len__(self) -> int:
         return len(self.uv_px)
 
     def select(self, keep: BoolArray) -> "Dots":
         """Return the dots where ``keep`` is true."""
-        return Dots(
-            self.uv_px[keep],
-            self.cov_px2[keep],
-            self.area_px2[keep],
-            self.touches_border[keep],
-            self.is_completed[keep],
-            self.polarity,
+        return replace(
+            self,
+            uv_px=self.uv_px[keep],
+            cov_px2=self.cov_px2[keep],
+            area_px2=self.area_px2[keep],
+            touches_border=self.touches_border[keep],
+            is_completed=self.is_completed[keep],
+            blur_px=self.blur_px[keep],
+            light_grey=self.light_grey[keep],
+            dark_grey=self.dark_grey[keep],
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Regions:
-    """Compact foreground regions: label image, and for each region its label, box and half-level area."""
-
-    labels: NDArray[np.int32]
-    label: NDArray[np.int64]
-    box: NDArray[np.int64]  # left, top, width, height
-    area_px2: FloatArray
 
 
 def detect_dots(grey: GreyImage, *, polarity: Polarity = "auto", keep_cut_dots: bool = False) -> Dots:
@@ -92,7 +91,7 @@ def detect_dots(grey: GreyImage, *, polarity: Polarity = "auto", keep_cut_dots: 
 
     Parameters
     ----------
-    grey : ndarray of uint8, shape (rows, columns)
+    grey : ndarray of uint8 or uint16, shape (rows, columns)
     polarity : str, optional
         Which is the lighter; "auto" takes the one that yields clearly more dots.
     keep_cut_dots : bool, optional
@@ -106,20 +105,23 @@ def detect_dots(grey: GreyImage, *, polarity: Polarity = "auto", keep_cut_dots: 
     Raises
     ------
     ShapeError
-        If ``grey`` is not a two-dimensional array of uint8.
+        If ``grey`` is not a two-dimensional array of uint8 or uint16.
     CalibrationError
         If no dot is found, or as many light as dark ones.
     """
-    if grey.ndim != 2 or grey.dtype != np.uint8:
+    if grey.ndim != 2 or grey.dtype not in (np.uint8, np.uint16):
         raise ShapeError(
-            f"grey has shape {grey.shape} and type {grey.dtype}; expected (rows, columns) of uint8"
+            f"grey has shape {grey.shape} and type {grey.dtype}; expected (rows, columns) of uint8 or uint16"
         )
-    candidates: list[tuple[Polarity, NDArray[np.uint8], _Regions]] = []
+    light = grey.astype(np.float32)
+    if grey.dtype == np.uint16:
+        light *= np.float32(255 / 65535)
+    candidates: list[tuple[Polarity, Light, Regions]] = []
     if polarity in ("auto", "white-on-black"):
-        candidates.append(("white-on-black", grey, _round_regions(grey)))
+        candidates.append(("white-on-black", light, round_regions(light)))
     if polarity in ("auto", "black-on-white"):
-        inverse = np.asarray(255 - grey, dtype=np.uint8)
-        candidates.append(("black-on-white", inverse, _round_regions(inverse)))
+        inverse = np.float32(255) - light
+        candidates.append(("black-on-white", inverse, round_regions(inverse)))
     candidates.sort(key=lambda c: len(c[2].label), reverse=True)
     n_best = len(candidates[0][2].label)
     if n_best == 0:
@@ -137,77 +139,6 @@ def detect_dots(grey: GreyImage, *, polarity: Polarity = "auto", keep_cut_dots: 
     chosen, light, regions = candidates[0]
     dots = _measure(light, regions, chosen)
     return dots if keep_cut_dots else dots.select(~dots.touches_border | dots.is_completed)
-
-
-def _round_regions(light: NDArray[np.uint8]) -> _Regions:
-    """Return the compact, round regions brighter than halfway between local dark and local bright."""
-    smooth = np.asarray(cv2.GaussianBlur(light, (0, 0), 1.0), dtype=np.uint8)
-    threshold, has_contrast = _local_threshold(smooth)
-    mask = ((smooth > threshold) & has_contrast).astype(np.uint8)
-    n, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=cv2.CV_32S)
-    labels = np.asarray(found, dtype=np.int32)
-    box = stats[:, :4].astype(np.int64)
-    area = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
-    rows, columns = light.shape
-    fits = (area >= MIN_AREA_PX2) & (box[:, 2] < columns / 4) & (box[:, 3] < rows / 4)
-    fits[0] = False
-    at_edge = (
-        (box[:, 0] == 0)
-        | (box[:, 1] == 0)
-        | (box[:, 0] + box[:, 2] == columns)
-        | (box[:, 1] + box[:, 3] == rows)
-    )
-    # Moments of the half-level regions, all at once: sums over the picture grouped by label.
-    v, u = np.nonzero(fits[labels])
-    group = labels[v, u]
-    count = np.bincount(group, minlength=n).clip(1)
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(group, weights=values, minlength=n) / count)
-
-    u_local = u - box[group, 0].astype(np.float64)
-    v_local = v - box[group, 1].astype(np.float64)
-    u_mean, v_mean = mean(u_local), mean(v_local)
-    uu = mean(u_local * u_local) - u_mean**2 + 1 / 12  # a pixel is a square, not a point
-    vv = mean(v_local * v_local) - v_mean**2 + 1 / 12
-    uv = mean(u_local * v_local) - u_mean * v_mean
-    half_trace, root = (uu + vv) / 2, np.hypot((uu - vv) / 2, uv)
-    major, minor = half_trace + root, np.maximum(half_trace - root, 1e-9)
-    fill = area / (4 * np.pi * np.sqrt(major * minor))
-    is_round = (np.sqrt(major / minor) < MAX_AXIS_RATIO) & (fill > MIN_FILL_OF_ELLIPSE)
-    keep = np.flatnonzero(fits & (is_round | at_edge))
-    if not np.any(is_round & fits):
-        keep = keep[:0]
-    elif len(keep):
-        # Specks of dust are round too: dots of one target differ by less than this across the picture.
-        typical = (
-            np.median(area[np.flatnonzero(fits & is_round & ~at_edge)])
-            if np.any(fits & is_round & ~at_edge)
-            else np.median(area[keep])
-        )
-        keep = keep[(area[keep] < 3 * typical) & ((area[keep] > typical / 3) | at_edge[keep])]
-    return _Regions(labels, keep.astype(np.int64), box[keep], area[keep])
-
-
-def _local_threshold(smooth: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Return, per pixel, the middle between the local dark and bright level, and where they differ."""
-    tile = 8
-    rows, columns = smooth.shape
-    padded = cv2.copyMakeBorder(smooth, 0, -rows % tile, 0, -columns % tile, cv2.BORDER_REPLICATE)
-    tiles = padded.reshape(padded.shape[0] // tile, tile, padded.shape[1] // tile, tile)
-    low, high = tiles.min(axis=(1, 3)), tiles.max(axis=(1, 3))
-    # A sixth of the picture's height holds several dots of any target worth fitting.
-    reach = max(3, (rows // 6 // tile) | 1)
-    kernel = np.ones((reach, reach), np.uint8)
-    low = cv2.erode(low, kernel, borderType=cv2.BORDER_REPLICATE)
-    high = cv2.dilate(high, kernel, borderType=cv2.BORDER_REPLICATE)
-    size = (padded.shape[1], padded.shape[0])
-    low_map = cv2.resize(cv2.blur(low.astype(np.float32), (reach, reach)), size)[:rows, :columns]
-    high_map = cv2.resize(cv2.blur(high.astype(np.float32), (reach, reach)), size)[:rows, :columns]
-    contrast = high_map - low_map
-    strongest = float(np.percentile(contrast, 95))
-    needed = max(MIN_CONTRAST_GREY, MIN_RELATIVE_CONTRAST * strongest)
-    return (low_map + high_map) / 2, contrast >= needed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,7 +164,7 @@ class _Moments:
     spread_px2: FloatArray
 
 
-def _measure(light: NDArray[np.uint8], regions: _Regions, polarity: Polarity) -> Dots:
+def _measure(light: Light, regions: Regions, polarity: Polarity) -> Dots:
     """Return the light-weighted centroids of the regions."""
     n = len(regions.label)
     rows, columns = light.shape
@@ -272,29 +203,53 @@ def _measure(light: NDArray[np.uint8], regions: _Regions, polarity: Polarity) ->
     touches = to_border < np.ceil(2 * blur)
     cov = np.array([m.cov_px2 for m in moments])
     completed = np.zeros(n, dtype=np.bool_)
+    blurs = np.array([m.blur_px for m in moments])
+    blurs[touches] = np.nan
     whole = np.flatnonzero(good & ~touches)
     if len(whole) >= 3:
-        guides = whole[Neighbours(middle[whole]).nearest(middle, 3)[1]]
+        ratio = area_ratios(uv[whole], area[whole])
+        # Shapes of the small dots: what a large one would be at its place.
+        shrink = np.where(ratio > np.sqrt(LARGE_AREA_RATIO), LARGE_AREA_RATIO, 1.0)
+        spread = np.array([moments[k].spread_px2 for k in whole]) - blur**2 * np.eye(2)
+        shape = 4 * spread / shrink[:, None, None]
+        sizes = (1.0, LARGE_AREA_RATIO) if np.any(shrink > 1) else (1.0,)
+        near = Neighbours(middle[whole]).nearest(middle, 3)[1]
         for i in np.flatnonzero(good & touches):
-            near = guides[i]
-            spread = np.mean([moments[k].spread_px2 for k in near], axis=0)
-            away = middle[i] - middle[near[0]]
-            dot = complete_cut_dot(
-                *_normalised(
-                    patches[i], middle[i], levels[near[0]] + slopes[near[0]] @ away, slopes[near[0]]
-                ),
-                box_px=(left[i], top[i], left[i] + width[i] - 1, top[i] + height[i] - 1),
-                shape_px2=4 * (spread - blur**2 * np.eye(2)),
-                blur_px=float(blur),
-                noise=max(patches[near[0]].noise_grey, MIN_NOISE_GREY) / float(np.ptp(levels[near[0]])),
-                size_px=(columns, rows),
+            k = whole[near[i, 0]]
+            uv_light = _normalised(
+                patches[i], middle[i], levels[k] + slopes[k] @ (middle[i] - middle[k]), slopes[k]
             )
-            if dot is not None:
-                uv[i], cov[i], area[i], completed[i] = dot.uv_px, dot.cov_px2, area[near].mean(), True
-    return Dots(uv[good], cov[good], area[good], touches[good], completed[good], polarity)
+            fits = [
+                complete_cut_dot(
+                    *uv_light,
+                    box_px=(left[i], top[i], left[i] + width[i] - 1, top[i] + height[i] - 1),
+                    shape_px2=size * shape[near[i]].mean(axis=0),
+                    blur_px=float(blur),
+                    noise=max(patches[k].noise_grey, MIN_NOISE_GREY) / float(np.ptp(levels[k])),
+                    size_px=(columns, rows),
+                )
+                for size in sizes
+            ]
+            found: list[CompletedDot] = [dot for dot in fits if dot is not None]
+            if found:
+                dot = min(found, key=lambda f: f.rms)
+                uv[i], cov[i], completed[i] = dot.uv_px, dot.cov_px2, True
+                area[i] = np.pi * np.sqrt(np.linalg.det(dot.shape_px2))
+    ends = levels if polarity == "white-on-black" else 255 - levels[:, ::-1]
+    return Dots(
+        uv[good],
+        cov[good],
+        area[good],
+        touches[good],
+        completed[good],
+        polarity,
+        blurs[good],
+        ends[good, 1],
+        ends[good, 0],
+    )
 
 
-def _patch(light: NDArray[np.uint8], regions: _Regions, i: int, reach: int) -> _Patch:
+def _patch(light: Light, regions: Regions, i: int, reach: int) -> _Patch:
     """Cut out a region with its rim of ``reach`` pixels and the background beyond."""
     rows, columns = light.shape
     left, top, width, height = (int(x) for x in regions.box[i])

@@ -1,0 +1,74 @@
+"""Small dots and large ones: each dot's area beside that of the small dots around it.
+
+Distance, slant and distortion change the dots' areas smoothly over a picture, so only dots of one
+neighbourhood are compared.
+"""
+
+import numpy as np
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_host.calibration.neighbours import Neighbours
+from bricktrack_host.calibration.printed_target import LARGE_RATIO
+
+LARGE_AREA_RATIO = LARGE_RATIO**2
+MAX_ODD = 0.35
+"""Share of the way from small to large by which a dot may miss its class."""
+
+_N_AROUND = 24
+_SMALL_PERCENTILE = 30.0  # a quarter are large: of 24 dots more than 16 are so once in 5 million
+_N_ROUNDS = 3
+
+
+def area_ratios(uv_px: FloatArray, area_px2: FloatArray) -> FloatArray:
+    """Return each dot's area by that of the small dots around it.
+
+    Parameters
+    ----------
+    uv_px : ndarray, shape (n, 2), px
+    area_px2 : ndarray, shape (n,), px^2
+
+    Returns
+    -------
+    ratio : ndarray, shape (n,)
+        About 1 for small dots and 1.96 for large ones. All are about 1 where there is one size only.
+    """
+    n = len(uv_px)
+    log_area = np.log(area_px2)
+    near = Neighbours(uv_px).nearest(uv_px, min(_N_AROUND, n))[1]
+    small = np.percentile(log_area[near], _SMALL_PERCENTILE, axis=1)
+    step = np.log(LARGE_AREA_RATIO)
+    if n >= _N_AROUND:
+        # A plane through the neighbourhood's areas, once it is known which are large.
+        offset = uv_px[near] - uv_px[:, None]
+        scale = np.abs(offset).max(axis=(1, 2))[:, None, None]
+        design = np.concatenate([np.ones((*near.shape, 1)), offset / scale], axis=2)
+        for _ in range(_N_ROUNDS):
+            share = (log_area - small) / step
+            is_large = share > 0.5
+            as_small = log_area - step * is_large
+            # What fits neither class has no say.
+            weight = (np.abs(share - is_large) < MAX_ODD)[near].astype(np.float64)[..., None]
+            normal = np.swapaxes(design * weight, 1, 2) @ design + 1e-6 * np.eye(3)
+            right = np.swapaxes(design * weight, 1, 2) @ as_small[near][..., None]
+            count = weight[:, :, 0].sum(axis=1)
+            fitted = np.linalg.solve(normal, right)[:, 0, 0]
+            small = np.where(count >= 8, fitted, small)
+    return np.asarray(np.exp(log_area - small))
+
+
+def size_classes(ratio: FloatArray) -> IntArray:
+    """Return 1 for large dots, 0 for small ones, and -1 where the area fits neither.
+
+    Parameters
+    ----------
+    ratio : ndarray, shape (n,)
+        As `area_ratios` returns it.
+
+    Examples
+    --------
+    >>> size_classes(np.array([1.02, 1.9, 1.4, 0.6])).tolist()
+    [0, 1, -1, -1]
+    """
+    share = np.log(ratio) / np.log(LARGE_AREA_RATIO)
+    nearest = np.clip(np.rint(share), 0, 1)
+    return np.where(np.abs(share - nearest) < MAX_ODD, nearest, -1).astype(np.int64)
