@@ -14,7 +14,7 @@ from bricktrack_host.fusion.fusion_problem import (
     build_problem,
 )
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem, residuals
+from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem, residuals, score_noise
 
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
@@ -146,13 +146,12 @@ def _choose_noise(
         (NoiseLevel(share, _LEVEL_STEP**j), NoiseLevel(share * _LEVEL_STEP**i, _LEVEL_STEP**j))
         for i, j in steps
     ]
-    gyro = np.repeat(problem.gyro_var[..., None], len(levels), axis=2)
-    acc = np.repeat(problem.acc_var[..., None], len(levels), axis=2)
+    shape = (len(parts), len(levels), len(problem.dt_s))
+    gyro, acc = np.zeros(shape), np.zeros(shape)
     for b, part in enumerate(parts):
         for i, (of_gyro, of_acc) in enumerate(levels):
-            gyro[: len(part.gyro_fixed), b, i] = part.gyro(of_gyro)
-            acc[: len(part.acc_fixed), b, i] = part.acc(of_acc)
-    passed = Filter(problem.with_noise_choices(gyro, acc), keep=False)
-    best = np.argmax(passed.log_likelihood.reshape(len(parts), len(levels)) - price, axis=1)
-    last = passed.last.x.reshape(len(parts), len(levels), -1)
+            gyro[b, i, : len(part.gyro_fixed)] = part.gyro(of_gyro)
+            acc[b, i, : len(part.acc_fixed)] = part.acc(of_acc)
+    log_likelihood, last = score_noise(problem, gyro, acc)
+    best = np.argmax(log_likelihood - price, axis=1)
     return [levels[i] for i in best], [last[b, i] for b, i in enumerate(best)]

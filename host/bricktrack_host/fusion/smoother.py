@@ -3,25 +3,22 @@
 The equations are DESIGN 8.2's. SI units inside. Error state, 22 components: attitude (body axes), position
 and velocity of the IMU point (camera axes), gyro and accelerometer bias, gravity (camera axes), time offset,
 clock skew, accelerometer-minus-gyro lag, and what the accelerometer's low-pass takes from its second
-derivative. Arrays put time first and the runs of the batch second, so that each
-step of the one loop over time works on contiguous memory; a run shorter than the others is padded with empty
-steps.
+derivative. Arrays put time first and the runs of the batch second; a run shorter than the others is padded
+with empty steps. The loops over time are compiled (`smoother_kernel`).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
+from bricktrack_host.fusion.smoother_kernel import backward_pass, forward_pass
 
 N_STATES = 22
-N_MOVING = 9  # attitude, position, velocity: the others stand still or wander
 ATT, POS, VEL, BG, BA, GRAV = (slice(3 * i, 3 * i + 3) for i in range(6))
 TAU, SKEW, LAG, LOSS = 18, 19, 20, 21
-_NIS_CAP = 100.0  # so that an outlier does not choose the noise
-CHI2_6_95 = 12.59  # 95 % point of chi-square with 6 degrees of freedom
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,25 +77,6 @@ class Problem:
     start: "State"
     P_start: FloatArray
 
-    def with_noise_choices(self, gyro_var: FloatArray, acc_var: FloatArray) -> "Problem":
-        """Return a batch in which each run stands once for each choice of noise, choices running fastest.
-
-        Parameters
-        ----------
-        gyro_var, acc_var : ndarray, shape (K - 1, B, n_choices)
-        """
-        n = gyro_var.shape[2]
-        per_run = {"lever_arm_m", "bg_lin", "ba_lin", "tau_lin", "skew_lin", "lag_lin", "loss_lin", "P_start"}
-        changed: dict[str, Any] = {
-            f.name: np.repeat(getattr(self, f.name), n, axis=0 if f.name in per_run else 1)
-            for f in fields(self)
-            if f.name not in ("start", "gyro_var", "acc_var")
-        }
-        changed["start"] = State(np.repeat(self.start.R, n, axis=0), np.repeat(self.start.x, n, axis=0))
-        changed["gyro_var"] = gyro_var.reshape(len(gyro_var), -1)
-        changed["acc_var"] = acc_var.reshape(len(acc_var), -1)
-        return Problem(**changed)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
@@ -134,21 +112,6 @@ class Estimate:
 
 def _matvec(A: FloatArray, v: FloatArray) -> FloatArray:
     return np.asarray((A @ v[..., None])[..., 0])
-
-
-def _small_rvec(R: FloatArray) -> FloatArray:
-    """Return rotation vectors of rotations well below 90 degrees, cheaply."""
-    v = 0.5 * np.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
-    )
-    s2 = np.minimum((v * v).sum(axis=-1, keepdims=True), 1.0)
-    return np.asarray(v * (1 + s2 / 6 + 0.075 * s2 * s2))
-
-
-def _move(state: State, dx: FloatArray) -> State:
-    x = state.x + dx
-    x[..., ATT] = 0.0
-    return State(state.R @ matrix_from_rvec(dx[..., ATT]), x)
 
 
 def observe(
@@ -197,19 +160,6 @@ def residuals(problem: Problem, state: State, at: IntArray, b: int) -> tuple[Flo
     return np.concatenate([turn, problem.p_seen_m[at, b] - p], axis=-1), H
 
 
-def _process_noise(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Return the noise of attitude, position and velocity (K-1, B, 9, 9), and of the biases (.., 6)."""
-    dt = problem.dt_s
-    Q = np.zeros((*dt.shape, N_MOVING, N_MOVING))
-    i = np.arange(3)
-    Q[..., i, i] = (problem.gyro_var * dt)[..., None]
-    Q[..., 6 + i, 6 + i] = (problem.acc_var * dt)[..., None]
-    Q[..., 3 + i, 6 + i] = Q[..., 6 + i, 3 + i] = (problem.acc_var * dt**2 / 2)[..., None]
-    Q[..., 3 + i, 3 + i] = (problem.acc_var * dt**3 / 3)[..., None]
-    walk = np.stack([problem.gyro_bias_walk * dt, problem.acc_bias_walk * dt], axis=-1)
-    return Q, np.repeat(walk, 3, axis=-1)
-
-
 def _sensitivities(problem: Problem) -> FloatArray:
     """Return, in body axes, what changes dv: attitude, accelerometer bias, lag, loss; then the same for dp.
 
@@ -228,7 +178,7 @@ def _sensitivities(problem: Problem) -> FloatArray:
 
 
 class Filter:
-    """The forward pass; when kept whole, the smoother can run back over it.
+    """The forward pass over a batch, kept whole, so that the smoother can run back over it.
 
     Attributes
     ----------
@@ -238,104 +188,24 @@ class Filter:
         By how much the covariance of a surprising frame was enlarged.
     log_likelihood : ndarray, shape (B,)
         Of the frames given the past; what one frame can take away is bounded.
-    last : State, leading shape (B,)
-        After the last frame: of what stands still, all that the run tells.
     """
 
-    def __init__(self, problem: Problem, *, keep: bool = True) -> None:
+    def __init__(self, problem: Problem) -> None:
         n_nodes, n_runs = problem.has_frame.shape
         self._problem = problem
-        n_kept = n_nodes if keep else 0
-        self.R = np.empty((n_kept, n_runs, 3, 3))
-        self.x = np.empty((n_kept, n_runs, N_STATES))
-        self.P = np.empty((n_kept, n_runs, N_STATES, N_STATES))
-        self._R_pred = np.empty_like(self.R)
-        self._x_pred = np.empty_like(self.x)
-        self._P_pred = np.empty_like(self.P)
-        self._F = np.zeros((max(n_kept - 1, 0), n_runs, N_MOVING, N_STATES))
+        self._effect = _sensitivities(problem)
+        self.R = np.empty((n_nodes, n_runs, 3, 3))
+        self.x = np.empty((n_nodes, n_runs, N_STATES))
+        self.P = np.empty((n_nodes, n_runs, N_STATES, N_STATES))
+        self._predicted = (np.empty_like(self.R), np.empty_like(self.x), np.empty_like(self.P))
         self.nis = np.full((n_nodes, n_runs), np.nan)
         self.inflation = np.ones((n_nodes, n_runs))
         self.log_likelihood = np.zeros(n_runs)
-        self._run(keep)
-
-    def _run(self, keep: bool) -> None:
-        pr = self._problem
-        n_nodes, n_runs = pr.has_frame.shape
-        sensor_lin = np.stack([pr.lag_lin, pr.loss_lin], axis=1)
-        any_frame = np.asarray(pr.has_frame.any(axis=1))
-        effect, dt1 = _sensitivities(pr), pr.dt_s[..., None]
-        Q, Q_walk = _process_noise(pr)
-        F = np.zeros((n_runs, N_MOVING, N_STATES))  # the other rows are the identity's
-        i3, walks = np.arange(3), np.arange(BG.start, BA.stop)
-        F[:, np.arange(N_MOVING), np.arange(N_MOVING)] = 1.0
-        R, x, P = pr.start.R.copy(), pr.start.x.copy(), pr.P_start.copy()
-        for k in range(n_nodes):
-            if k:
-                j, dt = k - 1, dt1[k - 1]
-                turned = R[:, None] @ effect[j].reshape(n_runs, 2, 3, 8)  # dv, dp in camera axes
-                F[:, ATT, ATT] = np.swapaxes(pr.R_step[j], -1, -2)
-                F[:, i3, 9 + i3] = -dt
-                F[:, 3 + i3, 6 + i3] = F[:, 6 + i3, 15 + i3] = dt
-                F[:, 3 + i3, 15 + i3] = 0.5 * dt * dt
-                F[:, VEL, ATT], F[:, POS, ATT] = turned[:, 0, :, :3], turned[:, 1, :, :3]
-                F[:, VEL, BA], F[:, POS, BA] = turned[:, 0, :, 3:6], turned[:, 1, :, 3:6]
-                F[:, VEL, LAG:], F[:, POS, LAG:] = turned[:, 0, :, 6:], turned[:, 1, :, 6:]
-                off = np.concatenate([x[:, BA] - pr.ba_lin, x[:, LAG:] - sensor_lin], axis=1)
-                step = R @ np.stack([pr.dv_mps[j], pr.dp_m[j]], axis=2)
-                step = np.swapaxes(step, 1, 2) + _matvec(turned[..., 3:], off[:, None])  # (B, [dv, dp], 3)
-                x[:, POS] += dt * x[:, VEL] + 0.5 * dt * dt * x[:, GRAV] + step[:, 1]
-                x[:, VEL] += dt * x[:, GRAV] + step[:, 0]
-                R = R @ pr.R_step[j]
-                R = R - R @ skew(dt * (x[:, BG] - pr.bg_lin))
-                R = 1.5 * R - 0.5 * R @ (np.swapaxes(R, -1, -2) @ R)  # one Newton step back to orthonormal
-                FP = F @ P
-                P = P.copy()
-                P[:, :N_MOVING] = FP
-                P[:, :, :N_MOVING] = np.swapaxes(FP, -1, -2)
-                P[:, :N_MOVING, :N_MOVING] = FP @ np.swapaxes(F, -1, -2) + Q[j]
-                P[:, walks, walks] += Q_walk[j]
-                if keep:
-                    self._F[j] = F
-            if keep:
-                self._R_pred[k], self._x_pred[k], self._P_pred[k] = R, x, P
-            if any_frame[k]:
-                R, x, P = self._update(k, R, x, P)
-            if keep:
-                self.R[k], self.x[k], self.P[k] = R, x, P
-        self.last = State(R, x)
-
-    def _update(
-        self, k: int, R: FloatArray, x: FloatArray, P: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        pr = self._problem
-        runs = np.flatnonzero(pr.has_frame[k])
-        state = State(R[runs], x[runs])
-        since_mid = pr.since_mid_s[k, runs]
-        dt = (state.x[:, TAU] - pr.tau_lin[runs]) + since_mid * (state.x[:, SKEW] - pr.skew_lin[runs])
-        omega = pr.omega_radps[k, runs] - state.x[:, BG]
-        R_hat, p_hat, H = observe(state, omega, pr.lever_arm_m[runs], since_mid, dt)
-        turn = rvec_from_matrix(np.swapaxes(R_hat, -1, -2) @ pr.R_seen[k, runs])
-        y = np.concatenate([turn, pr.p_seen_m[k, runs] - p_hat], axis=1)
-        before = P[runs]
-        PHt = before @ np.swapaxes(H, -1, -2)
-        predicted = H @ PHt
-        S = predicted + pr.cov_seen[k, runs]
-        nis = (y * np.linalg.solve(S, y[..., None])[..., 0]).sum(axis=1)
-        self.nis[k, runs] = nis
-        log_det = np.linalg.slogdet(S)[1]
-        self.log_likelihood[runs] -= 0.5 * (log_det + np.minimum(nis, _NIS_CAP))
-        # A frame beyond what S allows is believed less, in proportion: never refused, so that the filter
-        # finds back after it has gone wrong itself. The second pass judges with hindsight.
-        inflation = np.maximum(nis / CHI2_6_95, 1.0)
-        self.inflation[k, runs] = inflation
-        S = predicted + inflation[:, None, None] * pr.cov_seen[k, runs]
-        gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(PHt, -1, -2)), -1, -2)
-        moved = _move(state, _matvec(gain, y))
-        after = before - gain @ np.swapaxes(PHt, -1, -2)
-        R, x, P = R.copy(), x.copy(), P.copy()
-        R[runs], x[runs] = moved.R, moved.x
-        P[runs] = 0.5 * (after + np.swapaxes(after, -1, -2))
-        return R, x, P
+        kept = (True, self.R, self.x, self.P, *self._predicted, self.nis, self.inflation)
+        for b in range(n_runs):
+            self.log_likelihood[b], _ = _forward(
+                problem, b, self._effect, problem.gyro_var[:, b], problem.acc_var[:, b], kept
+            )
 
     def forward(self) -> Estimate:
         """Return the filtered states: each knows only the past."""
@@ -343,18 +213,65 @@ class Filter:
 
     def smooth(self) -> Estimate:
         """Return the states given all frames (Rauch, Tung and Striebel)."""
-        # G = P F^T P_pred^-1 for all steps at once, scaled to unit diagonal: the units differ by 1e10.
-        scale = 1 / np.sqrt(np.diagonal(self._P_pred[1:], axis1=-2, axis2=-1))
-        scaled = self._P_pred[1:] * scale[..., :, None] * scale[..., None, :]
-        FP = self.P[:-1].copy()
-        FP[..., :N_MOVING, :] = self._F @ self.P[:-1]
-        gains = np.swapaxes(np.linalg.solve(scaled, FP * scale[..., :, None]) * scale[..., :, None], -1, -2)
-        R, x, P = self.R.copy(), self.x.copy(), self.P.copy()
-        for k in range(len(R) - 2, -1, -1):
-            d = x[k + 1] - self._x_pred[k + 1]
-            d[:, ATT] = _small_rvec(np.swapaxes(self._R_pred[k + 1], -1, -2) @ R[k + 1])
-            moved = _move(State(self.R[k], self.x[k]), _matvec(gains[k], d))
-            R[k], x[k] = moved.R, moved.x
-            Pk = self.P[k] + gains[k] @ (P[k + 1] - self._P_pred[k + 1]) @ np.swapaxes(gains[k], -1, -2)
-            P[k] = 0.5 * (Pk + np.swapaxes(Pk, -1, -2))
+        R, x, P = np.empty_like(self.R), np.empty_like(self.x), np.empty_like(self.P)
+        pr = self._problem
+        for b in range(len(self.log_likelihood)):
+            backward_pass(
+                b, pr.dt_s, pr.R_step, self._effect, self.R, self.x, self.P, *self._predicted, R, x, P
+            )
         return Estimate(State(R, x), P, self.nis)
+
+
+def score_noise(problem: Problem, gyro_var: FloatArray, acc_var: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how likely the frames are under choices of inertial noise, and the filter's last states.
+
+    Parameters
+    ----------
+    gyro_var, acc_var : ndarray, shape (B, n_choices, K - 1), rad^2/s and m^2/s^3
+
+    Returns
+    -------
+    log_likelihood : ndarray, shape (B, n_choices)
+    last : ndarray, shape (B, n_choices, 22)
+        Of what stands still, all that the run tells.
+    """
+    n_runs, n_choices = gyro_var.shape[:2]
+    effect = _sensitivities(problem)
+    log_likelihood = np.zeros((n_runs, n_choices))
+    last = np.zeros((n_runs, n_choices, N_STATES))
+    for b in range(n_runs):
+        for i in range(n_choices):
+            log_likelihood[b, i], last[b, i] = _forward(
+                problem, b, effect, gyro_var[b, i], acc_var[b, i], _nothing_kept(problem)
+            )
+    return log_likelihood, last
+
+
+def _nothing_kept(problem: Problem) -> tuple[Any, ...]:
+    none3, none2 = np.empty((0, 0, 3, 3)), np.empty((0, 0, N_STATES))
+    none4 = np.empty((0, 0, N_STATES, N_STATES))
+    scratch = np.empty(problem.has_frame.shape), np.empty(problem.has_frame.shape)
+    return (False, none3, none2, none4, none3, none2, none4, *scratch)
+
+
+def _forward(
+    problem: Problem,
+    b: int,
+    effect: FloatArray,
+    gyro_var: FloatArray,
+    acc_var: FloatArray,
+    kept: tuple[Any, ...],
+) -> tuple[float, FloatArray]:
+    """Run the filter over one run of a batch; return the log-likelihood and the last state."""
+    pr = problem
+    x = pr.start.x[b].copy()
+    log_likelihood = forward_pass(
+        b, pr.dt_s, pr.R_step, pr.dv_mps, pr.dp_m, effect,
+        np.ascontiguousarray(gyro_var), np.ascontiguousarray(acc_var),
+        pr.gyro_bias_walk, pr.acc_bias_walk, pr.omega_radps,
+        pr.has_frame, pr.R_seen, pr.p_seen_m, pr.cov_seen, pr.since_mid_s,
+        pr.lever_arm_m[b], pr.bg_lin[b], np.append(pr.ba_lin[b], [pr.lag_lin[b], pr.loss_lin[b]]),
+        pr.tau_lin[b], pr.skew_lin[b],
+        pr.start.R[b].copy(), x, pr.P_start[b].copy(), *kept,
+    )  # fmt: skip
+    return float(log_likelihood), x

@@ -21,6 +21,7 @@ from bricktrack_host.fusion.smoother import (
     Problem,
     State,
     observe,
+    score_noise,
 )
 
 N_NODES, DT = 40, 0.01
@@ -230,10 +231,8 @@ def test_runs_of_a_batch_do_not_touch_each_other():
 def test_noise_choices_are_scored_as_if_each_ran_alone():
     a = straight_problem(8)
     factors = np.array([0.1, 1.0, 10.0])
-    choices = a.with_noise_choices(
-        np.repeat(a.gyro_var[..., None], 3, axis=2), a.acc_var[..., None] * factors
-    )
-    together = Filter(choices, keep=False).log_likelihood
+    acc = factors[None, :, None] * a.acc_var[:, 0]
+    together = score_noise(a, np.repeat(a.gyro_var.T[:, None], 3, axis=1), acc)[0][0]
     alone = [Filter(replace(a, acc_var=a.acc_var * f)).log_likelihood[0] for f in factors]
     assert np.allclose(together, alone, rtol=1e-9)
 

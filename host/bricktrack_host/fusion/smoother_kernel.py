@@ -1,0 +1,470 @@
+"""The smoother's loops over time, compiled: one run forwards, one run backwards.
+
+The equations are DESIGN 8.2's, the layout of the 22 states and the arrays are `smoother`'s. The transition is
+the identity but for the nine moving states, so only those rows are multiplied out. The loops hold no lock of
+the interpreter: runs can share the cores by threads.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from bricktrack_host.compiled import compiled
+
+N = 22
+M = 9  # attitude, position, velocity
+_NIS_CAP = 100.0  # so that an outlier does not choose the noise
+CHI2_6_95 = 12.59  # 95 % point of chi-square with 6 degrees of freedom
+CHI2_2_95 = 5.99
+_LEAST_PIVOT = 1e-13  # of a correlation matrix: rounding leaves no less
+
+
+@compiled
+def _rotation(v: Any, out: Any) -> None:
+    """Write Exp of a rotation vector."""
+    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if a2 < 1e-8:
+        s, c = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0
+    else:
+        a = np.sqrt(a2)
+        s, c = np.sin(a) / a, (1.0 - np.cos(a)) / a2
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = c * v[i] * v[j]
+        out[i, i] += 1.0 - c * a2
+    out[0, 1] -= s * v[2]
+    out[0, 2] += s * v[1]
+    out[1, 0] += s * v[2]
+    out[1, 2] -= s * v[0]
+    out[2, 0] -= s * v[1]
+    out[2, 1] += s * v[0]
+
+
+@compiled
+def _rotation_vector(A: Any, B: Any, out: Any) -> None:
+    """Write Log of A^T B, by the quaternion: good for every angle."""
+    C = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
+    trace = C[0, 0] + C[1, 1] + C[2, 2]
+    q = np.zeros(4)
+    i = 0
+    if trace > 0:
+        q[0] = 1 + trace
+        q[1], q[2], q[3] = C[2, 1] - C[1, 2], C[0, 2] - C[2, 0], C[1, 0] - C[0, 1]
+    else:
+        if C[1, 1] > C[0, 0]:
+            i = 1
+        if C[2, 2] > C[i, i]:
+            i = 2
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[1 + i] = 1 + C[i, i] - C[j, j] - C[k, k]
+        q[0] = C[k, j] - C[j, k]
+        q[1 + j], q[1 + k] = C[j, i] + C[i, j], C[k, i] + C[i, k]
+    norm = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    sign = 1.0 if q[0] >= 0 else -1.0
+    s = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2) / norm
+    w = sign * q[0] / norm
+    gain = 2.0 + s * s / 3.0 if s < 1e-4 else 2.0 * np.arctan2(s, w) / s
+    for i in range(3):
+        out[i] = gain * sign * q[1 + i] / norm
+
+
+@compiled
+def _turn_by(R: Any, v: Any) -> None:
+    """Replace R by R Exp(v)."""
+    E = np.empty((3, 3))
+    _rotation(v, E)
+    row = np.empty(3)
+    for i in range(3):
+        for j in range(3):
+            row[j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
+        for j in range(3):
+            R[i, j] = row[j]
+
+
+@compiled
+def _orthonormal(R: Any) -> None:
+    """Take one Newton step back to a rotation."""
+    S = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            S[i, j] = -0.5 * (R[0, i] * R[0, j] + R[1, i] * R[1, j] + R[2, i] * R[2, j])
+        S[i, i] += 1.5
+    row = np.empty(3)
+    for i in range(3):
+        for j in range(3):
+            row[j] = R[i, 0] * S[0, j] + R[i, 1] * S[1, j] + R[i, 2] * S[2, j]
+        for j in range(3):
+            R[i, j] = row[j]
+
+
+@compiled
+def _transition(R: Any, dt: float, R_step: Any, effect: Any, F: Any) -> None:
+    """Write the moving rows of the transition, shape (9, 22), for a state with attitude R."""
+    F[:] = 0.0
+    for i in range(3):
+        for j in range(3):
+            F[i, j] = R_step[j, i]
+        F[i, 9 + i] = -dt
+        F[3 + i, 3 + i] = 1.0
+        F[3 + i, 6 + i] = dt
+        F[3 + i, 15 + i] = 0.5 * dt * dt
+        F[6 + i, 6 + i] = 1.0
+        F[6 + i, 15 + i] = dt
+        for j in range(8):
+            at = j if j < 3 else (9 + j if j < 6 else 14 + j)
+            F[6 + i, at] = R[i, 0] * effect[0, j] + R[i, 1] * effect[1, j] + R[i, 2] * effect[2, j]
+            F[3 + i, at] = R[i, 0] * effect[3, j] + R[i, 1] * effect[4, j] + R[i, 2] * effect[5, j]
+
+
+@compiled
+def _times(F: Any, P: Any, out: Any) -> None:
+    """Write F P for the sparse F of `_transition`."""
+    for i in range(M):
+        row = out[i]
+        row[:] = 0.0
+        for m in range(N):
+            f = F[i, m]
+            if f != 0.0:
+                for j in range(N):
+                    row[j] += f * P[m, j]
+
+
+@compiled
+def _propagate(F: Any, P: Any, FP: Any, dt: float, gyro: float, acc: float, bg: float, ba: float) -> None:
+    """Replace P by F P F^T + Q."""
+    _times(F, P, FP)
+    for i in range(M):
+        for j in range(M, N):
+            P[i, j] = FP[i, j]
+            P[j, i] = FP[i, j]
+        for j in range(i + 1):
+            s = 0.0
+            for m in range(N):
+                s += FP[i, m] * F[j, m]
+            P[i, j] = s
+            P[j, i] = s
+    for i in range(3):
+        P[i, i] += gyro * dt
+        P[6 + i, 6 + i] += acc * dt
+        P[3 + i, 6 + i] += 0.5 * acc * dt * dt
+        P[6 + i, 3 + i] += 0.5 * acc * dt * dt
+        P[3 + i, 3 + i] += acc * dt * dt * dt / 3.0
+        P[9 + i, 9 + i] += bg * dt
+        P[12 + i, 12 + i] += ba * dt
+
+
+@compiled
+def _move(R: Any, x: Any, dt: float, R_step: Any, dv: Any, dp: Any, F: Any, off: Any, bg_lin: Any) -> None:
+    """Carry the state over one step; ``off`` is how far biases, lag and loss are from their linearisation."""
+    turn = np.empty(3)
+    for i in range(3):
+        step_v = R[i, 0] * dv[0] + R[i, 1] * dv[1] + R[i, 2] * dv[2]
+        step_p = R[i, 0] * dp[0] + R[i, 1] * dp[1] + R[i, 2] * dp[2]
+        for j in range(5):
+            at = 12 + j if j < 3 else 17 + j
+            step_v += F[6 + i, at] * off[j]
+            step_p += F[3 + i, at] * off[j]
+        x[3 + i] += dt * x[6 + i] + 0.5 * dt * dt * x[15 + i] + step_p
+        x[6 + i] += dt * x[15 + i] + step_v
+        turn[i] = -dt * (x[9 + i] - bg_lin[i])
+    row = np.empty(3)
+    for i in range(3):
+        for j in range(3):
+            row[j] = R[i, 0] * R_step[0, j] + R[i, 1] * R_step[1, j] + R[i, 2] * R_step[2, j]
+        R[i, 0] = row[0] + row[1] * turn[2] - row[2] * turn[1]
+        R[i, 1] = row[1] + row[2] * turn[0] - row[0] * turn[2]
+        R[i, 2] = row[2] + row[0] * turn[1] - row[1] * turn[0]
+    _orthonormal(R)
+
+
+@compiled
+def _factor(S: Any, n: int) -> None:
+    """Replace the lower triangle of S by its Cholesky factor."""
+    for i in range(n):
+        for j in range(i + 1):
+            s = S[i, j]
+            for m in range(j):
+                s -= S[i, m] * S[j, m]
+            S[i, j] = np.sqrt(s) if i == j else s / S[j, j]
+
+
+@compiled
+def _squared(L: Any, y: Any, n: int, out: Any) -> float:
+    """Write L^-1 y and return its square."""
+    total = 0.0
+    for i in range(n):
+        s = y[i]
+        for m in range(i):
+            s -= L[i, m] * out[m]
+        out[i] = s / L[i, i]
+        total += out[i] * out[i]
+    return total
+
+
+@compiled
+def _correct(H: Any, C: Any, y: Any, n: int, chi2_95: float, R: Any, x: Any, P: Any) -> Any:
+    """Take in ``n`` residuals y with Jacobian H and covariance C, in place.
+
+    Returns the innovation squared over its covariance, its log-determinant, and by how much C was enlarged: a
+    surprise is believed less, in proportion, never refused, so that the filter finds back after it has gone
+    wrong itself.
+    """
+    HP = np.zeros((n, N))
+    for i in range(n):
+        for m in range(N):
+            h = H[i, m]
+            if h != 0.0:
+                for j in range(N):
+                    HP[i, j] += h * P[m, j]
+    predicted, S, white = np.zeros((n, n)), np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        for j in range(i + 1):
+            s = 0.0
+            for m in range(N):
+                s += HP[i, m] * H[j, m]
+            predicted[i, j] = s
+            S[i, j] = s + C[i, j]
+    _factor(S, n)
+    log_det = 0.0
+    for i in range(n):
+        log_det += 2.0 * np.log(S[i, i])
+    nis = _squared(S, y, n, white)
+    inflation = max(nis / chi2_95, 1.0)
+    if inflation > 1.0:
+        for i in range(n):
+            for j in range(i + 1):
+                S[i, j] = predicted[i, j] + inflation * C[i, j]
+        _factor(S, n)
+        _squared(S, y, n, white)
+    for i in range(n):  # HP becomes L^-1 H P
+        for m in range(i):
+            for j in range(N):
+                HP[i, j] -= S[i, m] * HP[m, j]
+        for j in range(N):
+            HP[i, j] /= S[i, i]
+    dx = np.zeros(N)
+    for i in range(n):
+        for j in range(N):
+            dx[j] += HP[i, j] * white[i]
+    for i in range(n):
+        for r in range(N):
+            w = HP[i, r]
+            for j in range(N):
+                P[r, j] -= w * HP[i, j]
+    _turn_by(R, dx[:3])
+    for j in range(3, N):
+        x[j] += dx[j]
+    return nis, log_det, inflation
+
+
+@compiled
+def _observe_pose(
+    R: Any, x: Any, w: Any, arm: Any, since: float, dt: float, R_seen: Any, p_seen: Any, H: Any, y: Any
+) -> None:
+    """Write residual and Jacobian of a pose seen ``dt`` after the state by the present offset and skew."""
+    c = np.empty(3)  # velocity of the origin less that of the IMU, body axes
+    c[0] = -(w[1] * arm[2] - w[2] * arm[1])
+    c[1] = -(w[2] * arm[0] - w[0] * arm[2])
+    c[2] = -(w[0] * arm[1] - w[1] * arm[0])
+    H[:] = 0.0
+    for i in range(3):
+        H[i, i] = 1.0
+        H[i, 18], H[i, 19] = w[i], w[i] * since
+        H[3 + i, 0] = R[i, 1] * arm[2] - R[i, 2] * arm[1]
+        H[3 + i, 1] = R[i, 2] * arm[0] - R[i, 0] * arm[2]
+        H[3 + i, 2] = R[i, 0] * arm[1] - R[i, 1] * arm[0]
+        H[3 + i, 3 + i] = 1.0
+        v = x[6 + i] + R[i, 0] * c[0] + R[i, 1] * c[1] + R[i, 2] * c[2]
+        H[3 + i, 18], H[3 + i, 19] = v, v * since
+        y[3 + i] = p_seen[i] - (x[3 + i] - R[i, 0] * arm[0] - R[i, 1] * arm[1] - R[i, 2] * arm[2] + v * dt)
+    ahead = R.copy()
+    _turn_by(ahead, w * dt)
+    _rotation_vector(ahead, R_seen, y[:3])
+
+
+@compiled
+def forward_pass(
+    b: int,
+    dt: Any,
+    R_step: Any,
+    dv: Any,
+    dp: Any,
+    effect: Any,
+    gyro_var: Any,
+    acc_var: Any,
+    gyro_walk: Any,
+    acc_walk: Any,
+    omega: Any,
+    has_frame: Any,
+    R_seen: Any,
+    p_seen: Any,
+    cov_seen: Any,
+    since_mid: Any,
+    arm: Any,
+    bg_lin: Any,
+    off_lin: Any,
+    tau_lin: float,
+    skew_lin: float,
+    R: Any,
+    x: Any,
+    P: Any,
+    keep: bool,
+    R_kept: Any,
+    x_kept: Any,
+    P_kept: Any,
+    R_pred: Any,
+    x_pred: Any,
+    P_pred: Any,
+    nis: Any,
+    inflation: Any,
+) -> float:
+    """Run the filter over run ``b`` of a batch, from R, x and P, which end as the last state.
+
+    ``gyro_var`` and ``acc_var`` have shape (K - 1,), all else is `smoother.Problem`'s with time first;
+    ``off_lin`` holds where accelerometer bias, lag and loss were linearised. What is kept goes to column b.
+    Returns the log-likelihood of the frames.
+    """
+    n_nodes = has_frame.shape[0]
+    F, FP, H, y = np.zeros((M, N)), np.zeros((M, N)), np.zeros((6, N)), np.zeros(6)
+    off = np.empty(5)
+    w = np.empty(3)
+    log_likelihood = 0.0
+    for k in range(n_nodes):
+        if k > 0:
+            j = k - 1
+            h = dt[j, b]
+            if h > 0.0:
+                _transition(R, h, R_step[j, b], effect[j, b], F)
+                for i in range(3):
+                    off[i] = x[12 + i] - off_lin[i]
+                off[3], off[4] = x[20] - off_lin[3], x[21] - off_lin[4]
+                _move(R, x, h, R_step[j, b], dv[j, b], dp[j, b], F, off, bg_lin)
+                _propagate(F, P, FP, h, gyro_var[j], acc_var[j], gyro_walk[j, b], acc_walk[j, b])
+        if keep:
+            R_pred[k, b] = R
+            x_pred[k, b] = x
+            P_pred[k, b] = P
+        if has_frame[k, b]:
+            since = since_mid[k, b]
+            ahead = (x[18] - tau_lin) + since * (x[19] - skew_lin)
+            for i in range(3):
+                w[i] = omega[k, b, i] - x[9 + i]
+            _observe_pose(R, x, w, arm, since, ahead, R_seen[k, b], p_seen[k, b], H, y)
+            far, log_det, enlarged = _correct(H, cov_seen[k, b], y, 6, CHI2_6_95, R, x, P)
+            nis[k, b], inflation[k, b] = far, enlarged
+            log_likelihood -= 0.5 * (log_det + min(far, _NIS_CAP))
+        if keep:
+            R_kept[k, b] = R
+            x_kept[k, b] = x
+            P_kept[k, b] = P
+    return log_likelihood
+
+
+@compiled
+def backward_pass(
+    b: int,
+    dt: Any,
+    R_step: Any,
+    effect: Any,
+    R_kept: Any,
+    x_kept: Any,
+    P_kept: Any,
+    R_pred: Any,
+    x_pred: Any,
+    P_pred: Any,
+    R_out: Any,
+    x_out: Any,
+    P_out: Any,
+) -> None:
+    """Run the smoother of Rauch, Tung and Striebel over what `forward_pass` kept of run ``b``.
+
+    G = P F^T P_pred^-1 by Cholesky of the predicted correlations: the units differ by 1e10. The outputs may
+    not be the arrays that were kept.
+    """
+    last = R_kept.shape[0] - 1
+    F, L, B, D = np.zeros((M, N)), np.empty((N, N)), np.empty((N, N)), np.empty((N, N))
+    GD, scale, d, turn = np.empty((N, N)), np.empty(N), np.empty(N), np.empty(3)
+    R_out[last, b] = R_kept[last, b]
+    x_out[last, b] = x_kept[last, b]
+    P_out[last, b] = P_kept[last, b]
+    for k in range(last - 1, -1, -1):
+        if not dt[k, b] > 0.0:
+            R_out[k, b] = R_out[k + 1, b]
+            x_out[k, b] = x_out[k + 1, b]
+            P_out[k, b] = P_out[k + 1, b]
+            continue
+        P = P_kept[k, b]
+        _transition(R_kept[k, b], dt[k, b], R_step[k, b], effect[k, b], F)
+        _times(F, P, B)
+        for i in range(M, N):
+            B[i] = P[i]
+        pred = P_pred[k + 1, b]
+        for i in range(N):
+            scale[i] = 1.0 / np.sqrt(pred[i, i])
+        for i in range(N):
+            for j in range(i + 1):
+                s = pred[i, j] * scale[i] * scale[j]
+                for m in range(j):
+                    s -= L[i, m] * L[j, m]
+                L[i, j] = np.sqrt(max(s, _LEAST_PIVOT)) if i == j else s / L[j, j]
+            for j in range(N):
+                B[i, j] *= scale[i]
+        for i in range(N):  # B = G^T: first L^-1, then L^-T
+            for m in range(i):
+                f = L[i, m]
+                for j in range(N):
+                    B[i, j] -= f * B[m, j]
+            f = 1.0 / L[i, i]
+            for j in range(N):
+                B[i, j] *= f
+        for i in range(N - 1, -1, -1):
+            for m in range(i + 1, N):
+                f = L[m, i]
+                for j in range(N):
+                    B[i, j] -= f * B[m, j]
+            f = 1.0 / L[i, i]
+            for j in range(N):
+                B[i, j] *= f
+        for i in range(N):
+            for j in range(N):
+                B[i, j] *= scale[i]
+                D[i, j] = P_out[k + 1, b, i, j] - pred[i, j]
+            d[i] = x_out[k + 1, b, i] - x_pred[k + 1, b, i]
+        _rotation_vector(R_pred[k + 1, b], R_out[k + 1, b], turn)
+        for i in range(3):
+            d[i] = turn[i]
+        after = P_out[k, b]
+        for i in range(N):
+            row = GD[i]
+            row[:] = 0.0
+            for m in range(N):
+                g = B[m, i]
+                for j in range(N):
+                    row[j] += g * D[m, j]
+        # P + (G D) G^T, its lower triangle mirrored.
+        for i in range(N):
+            for j in range(N):
+                after[i, j] = P[i, j]
+            for m in range(N):
+                g = GD[i, m]
+                for j in range(i + 1):
+                    after[i, j] += g * B[m, j]
+        for i in range(N):
+            for j in range(i):
+                after[j, i] = after[i, j]
+        for i in range(N):
+            s = 0.0
+            for m in range(N):
+                s += B[m, i] * d[m]
+            if i < 3:
+                turn[i] = s
+                x_out[k, b, i] = 0.0
+            else:
+                x_out[k, b, i] = x_kept[k, b, i] + s
+        for i in range(3):
+            for j in range(3):
+                R_out[k, b, i, j] = R_kept[k, b, i, j]
+        _turn_by(R_out[k, b], turn)
