@@ -36,14 +36,11 @@ from bricktrack_device.recovery import rebuild_manifest
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.run_store import RunStore
 from bricktrack_device.systemd_notify import notify
+from bricktrack_device.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
 
 WATCHDOG_PERIOD_S = 1.0
-MAX_BEAT_AGE_S = 8.0
-"""A thread that did nothing for so long hangs: systemd's watchdog is not fed any more."""
-MAX_SAVING_S = 60.0
-"""A slow card may take so long for one run."""
 
 
 class UnitService:
@@ -168,6 +165,8 @@ class Daemon:
                 for number in (signal.SIGTERM, signal.SIGINT):
                     signal.signal(number, self.stop)
             service.health.refresh_if_due(recorder.state)
+            notify("STATUS=trying the sensors")
+            service.health.test_hardware(self._stop.is_set)
             self._serve(recorder, server, service.health, store.folder)
         finally:
             store.unlock()
@@ -183,11 +182,10 @@ class Daemon:
             " (simulated)" if self._rig.simulated else "",
         )  # fmt: skip
         notify("READY=1")
+        watchdog = Watchdog(recorder, server)
         try:
             while not self._stop.wait(WATCHDOG_PERIOD_S):
-                limit_s = MAX_SAVING_S if recorder.state == "saving" else MAX_BEAT_AGE_S
-                if recorder.beat_age_s < limit_s and server.beat_age_s < MAX_BEAT_AGE_S:
-                    notify(f"WATCHDOG=1\nSTATUS={recorder.state}")
+                watchdog.feed()
                 health.refresh_if_due(recorder.state)
         finally:
             notify("STOPPING=1")

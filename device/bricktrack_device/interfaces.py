@@ -86,6 +86,10 @@ class Camera(Protocol):
         """Return a picture of now while streaming; `None` where none can be had. Never waits for long."""
         ...
 
+    def problem(self) -> str | None:
+        """Return in words what is wrong with a camera that should stream, or `None`; cheap."""
+        ...
+
     def stop(self) -> None:
         """Stop streaming; frames under way may be lost. Calling it twice does no harm."""
         ...

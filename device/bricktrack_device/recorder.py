@@ -28,6 +28,7 @@ from bricktrack_device.interfaces import Rig
 from bricktrack_device.recording import Recording, save
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.room import check_room, disk_needed_bytes
+from bricktrack_device.run_light import RunLight
 from bricktrack_device.run_store import RunStore
 from bricktrack_device.run_writer import RunWriter
 from bricktrack_device.session import Session
@@ -109,6 +110,8 @@ class Recorder:
         self._try_again_at = 0.0
         self._last_error = ""
         self._doing = ""
+        self._lost_camera = ""
+        self._light = RunLight(config.leds, rig)
         self._last_beat = time.monotonic()
 
     # From other threads
@@ -149,7 +152,7 @@ class Recorder:
         trigger = session.trigger if session else None
         return RecorderStatus(
             state=self.state,
-            reason=self._machine.reason or self._doing or (trigger.waiting_words() if trigger else ""),
+            reason=self._machine.reason or self._doing or self._waiting_words(session),
             run_id=session.run_id if session else "",
             frames=session.ring.n_packets if session else 0,
             frame_age_ms=None if newest_us is None else (monotonic_ns() - newest_us * 1000) / 1e6,
@@ -160,9 +163,21 @@ class Recorder:
             disk_needed_bytes=disk_needed_bytes(self._config),
         )
 
+    @property
+    def restart_reason(self) -> str:
+        """Why only a restart of the process helps, in words; empty while it does not, or holds a run."""
+        return "" if self._session or self._unsaved else self._lost_camera
+
+    @staticmethod
+    def _waiting_words(session: Session | None) -> str:
+        if session is None or session.trigger is None:
+            return ""
+        return "; ".join(w for w in (session.trigger.waiting_words(), *session.missing) if w)
+
     # The thread
 
     def _run(self) -> None:
+        self._light.put_out_leftovers()
         while not self._stopping.is_set():
             self._last_beat = time.monotonic()
             try:
@@ -216,12 +231,16 @@ class Recorder:
                     session.note_trigger()
                 elif not session.has_sensors:
                     self._fail("no sensor is left: " + "; ".join(session.missing))
+                elif self._auto_arm and session.lost_required:
+                    self._fail(f"lost while armed: {session.lost_required}. The unit will arm itself again")
             elif self.state == "recording" and session.is_over(monotonic_ns()):
                 self._finish()
         elif self.state == "fault" and self._unsaved and time.monotonic() >= self._try_again_at:
             self._try_again_at = time.monotonic() + _RETRY_S
             if self._store.free_bytes() > self._unsaved.recording.n_bytes + (1 << 20):
                 self._save_again()
+        elif self.state == "fault" and self._auto_arm and time.monotonic() >= self._try_again_at:
+            self._change("disarm")
         elif self.state == "idle" and self._auto_arm and time.monotonic() >= self._try_again_at:
             self._try_again_at = time.monotonic() + _RETRY_S
             try:
@@ -244,14 +263,15 @@ class Recorder:
                 run_id=self._store.new_run_id(label),
                 label=label,
                 duration_s=duration_s,
+                light=self._light,
                 beat=self._beat,
             )
             self._session = session
             try:
                 session.open(lambda: self._inbox.put(_Wake()))
             except BaseException:
-                self._session = None
-                session.close()
+                self._close_session()
+                self._light.put_out()
                 raise
         finally:
             self._doing = ""
@@ -352,6 +372,7 @@ class Recorder:
             logger.exception("a bug in the recorder while it ends")
         finally:
             self._close_session()
+            self._light.put_out()
         if self._unsaved is not None:
             logger.error(
                 "%s: lost from memory; its folder holds what was saved", self._unsaved.recording.run_id
@@ -381,9 +402,12 @@ class Recorder:
         session, self._session = self._session, None
         if session is not None:
             session.close()
+            self._lost_camera = self._lost_camera or session.lost_camera
 
     def _change(self, cause: Cause, *, reason: str = "", run_id: str = "") -> None:
         change = self._machine.change(cause, reason=reason)
+        if change.after in ("idle", "fault"):
+            self._light.put_out()
         session = self._session
         of_run = run_id or (session.run_id if session else "")
         logger.info(

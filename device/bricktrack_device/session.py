@@ -19,6 +19,7 @@ from bricktrack_device.interfaces import Camera, Rig
 from bricktrack_device.recording import ImuRecording, Recording, RunLog
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.ring import FrameRing, VideoCut, cut_video
+from bricktrack_device.run_light import RunLight
 from bricktrack_device.trigger import Trigger
 
 logger = logging.getLogger(__name__)
@@ -47,6 +48,8 @@ class Session:
     rig : Rig
     run_id, label : str
     duration_s : float
+    light : RunLight
+        Lit when the session opens; whoever owns it puts it out.
     beat : callable
         Called while waiting; raises to give up.
     """
@@ -59,6 +62,7 @@ class Session:
         run_id: str,
         label: str,
         duration_s: float,
+        light: RunLight,
         beat: Callable[[], None],
     ) -> None:
         self.run_id = run_id
@@ -68,6 +72,7 @@ class Session:
         self.log = RunLog()
         self._config = config
         self._rig = rig
+        self._light = light
         self._beat = beat
         span_s = config.span_s(duration_s) + RING_SLACK_S
         self.ring = FrameRing(round((span_s + config.camera.iperiod / config.camera.frame_rate_hz) * 1e9))
@@ -75,6 +80,8 @@ class Session:
         self._camera: Camera | None = None
         self._camera_section: CameraSection | None = None
         self._camera_problem = ""
+        self._camera_words_told = ""
+        self.lost_camera = ""
         self.imus: list[ImuReader] = []
         self._imu_problems_told: set[str] = set()
         self._imu_resets_told: set[str] = set()
@@ -106,6 +113,7 @@ class Session:
             )
             self.imus.append(reader)
             reader.start()
+        self._light_leds()
         try:
             self._start_camera()
         except BricktrackError as e:
@@ -122,6 +130,16 @@ class Session:
         self._t_armed_ns = self.trigger.arm(on_first_edge)
         self.log.add("armed", run_id=self.run_id, line_is_high=self.trigger.line_is_high)
         self._rig.on_armed(self._t_armed_ns)
+
+    def _light_leds(self) -> None:
+        try:
+            self._light.light()
+        except HardwareError as e:
+            if self._config.camera.required:
+                raise RequestRefusedError("not-ready", f"leds: {e}") from e
+            self._note_missing(f"leds: {e}")
+        if self._light.words:
+            self.log.add("leds lit", words=self._light.words)
 
     def _start_camera(self) -> None:
         camera = self._camera = self._rig.open_camera()
@@ -182,6 +200,14 @@ class Session:
         return not self._camera_problem or any(i.is_ready for i in self.imus)
 
     @property
+    def lost_required(self) -> str:
+        """What the configuration requires and does not deliver any more, in words; empty if all is well."""
+        lost = [f"imu {i.name}: {i.problem}" for i in self.imus if i.settings.required and i.problem]
+        if self._config.camera.required and self._camera_problem:
+            lost.insert(0, f"camera: {self._camera_problem}")
+        return "; ".join(lost)
+
+    @property
     def window_ns(self) -> tuple[int, int]:
         """First and last instant that the run shall hold; around the arming where no edge has come."""
         t0_ns = self.t0_ns or self._t_armed_ns
@@ -202,8 +228,16 @@ class Session:
             if reader.reset_words and reader.name not in self._imu_resets_told:
                 self._imu_resets_told.add(reader.name)
                 self._note_missing(f"imu {reader.name}: {reader.reset_words}{self._when()}")
-        if self._camera_section is None or self._camera_problem:
+        self._watch_camera()
+
+    def _watch_camera(self) -> None:
+        """Note what the camera itself says is wrong, and when no pictures come any more."""
+        if self._camera is None or self._camera_section is None or self._camera_problem:
             return
+        words = self._camera.problem() or ""
+        if words and not self._camera_words_told:
+            self._camera_words_told = words
+            self._note_missing(f"{words}{self._when()}")
         period_ns = self._camera_section.frame_duration_us * 1000
         newest_us = self.ring.newest_us
         silent_ns = monotonic_ns() - (newest_us or 0) * 1000
@@ -277,6 +311,8 @@ class Session:
         hardware = self._rig.describe() | {
             f"sampler of imu {i.name}": i.scheduling for i in self.imus if i.scheduling
         }
+        if self._light.words:
+            hardware["leds"] = self._light.words
         return Recording(
             run_id=self.run_id,
             unit=self._config.unit.name,
@@ -322,6 +358,7 @@ class Session:
             try:
                 self._in_time("stop", camera.stop, CAMERA_STOP_TIMEOUT_S, give_up=False)
             except (BricktrackError, OSError) as e:
+                self.lost_camera = str(e)
                 logger.warning("camera: %s", e)
         for reader in self.imus:
             reader.stop()

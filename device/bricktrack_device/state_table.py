@@ -11,9 +11,9 @@ Cause = Literal[
 ]
 """What makes the unit change its state.
 
-``arm``, ``disarm``: a host's command (``arm`` also the configuration's ``auto_arm``); ``first-edge``: the
-square wave; ``window-over``: the clock; ``stop``: the daemon is told to end; ``saved``, ``save-failed``,
-``save-again``: the run store; ``failure``: no sensor is left, or a bug.
+``arm``, ``disarm``: a host's command, or the configuration's ``auto_arm``, which also leaves a fault;
+``first-edge``: the square wave; ``window-over``: the clock; ``stop``: the daemon is told to end; ``saved``,
+``save-failed``, ``save-again``: the run store; ``failure``: a sensor that is needed is lost, or a bug.
 """
 
 TRANSITIONS: dict[tuple[DaemonState, Cause], DaemonState] = {

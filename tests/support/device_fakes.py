@@ -4,6 +4,7 @@ import errno
 import os
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_manifest import CameraSection
+from bricktrack_device.hardware.led_bank import LedBank
 from bricktrack_device.interfaces import (
     BusOpener,
     Camera,
@@ -23,6 +25,7 @@ from bricktrack_device.interfaces import (
     FrameMetadata,
     FrameSink,
     I2cBus,
+    Leds,
     Still,
 )
 
@@ -158,6 +161,8 @@ class FakeCamera:
         self._thread: threading.Thread | None = None
         self.n_stops = 0
         self.picture: Still | None = None
+        self.trouble: str | None = None
+        self.stop_error: HardwareError | None = None
 
     def start(self, sink: FrameSink) -> CameraSection:
         if self.fail:
@@ -173,11 +178,16 @@ class FakeCamera:
     def still(self) -> Still | None:
         return self.picture
 
+    def problem(self) -> str | None:
+        return self.trouble
+
     def stop(self) -> None:
         self.n_stops += 1
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
+        if self.stop_error is not None:
+            raise self.stop_error
 
     def _stream(self, sink: FrameSink) -> None:
         t_ns = monotonic_ns()
@@ -216,6 +226,9 @@ class FakeRig:
 
     def bus_opener(self, bus: str) -> BusOpener:
         return self.buses.get(bus, FakeBusOpener())
+
+    def leds(self, pins: Sequence[str], *, active_high: bool = True) -> Leds:
+        return LedBank(pins, self.factory, active_high=active_high)
 
     def on_armed(self, t_armed_ns: int) -> None:
         self.armed_ns.append(t_armed_ns)

@@ -46,7 +46,9 @@ class LedBank:
     def close(self) -> None:
         """Switch off and give the pins back. Calling it twice does no harm."""
         while self._leds:
-            self._leds.pop().close()
+            led = self._leds.pop()
+            led.off()  # a kernel may keep the level of a pin that is given back
+            led.close()
 
     def __enter__(self) -> Self:
         """Return itself."""

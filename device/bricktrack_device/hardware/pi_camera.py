@@ -9,7 +9,7 @@ from typing import Any
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_manifest import CameraSection
-from bricktrack_device.hardware.bounded import finishes
+from bricktrack_device.bounded import finishes
 from bricktrack_device.hardware.camera_checks import (
     ControlsCheck,
     FrameReport,

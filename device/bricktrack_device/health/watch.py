@@ -5,13 +5,14 @@ While the unit is armed, records or saves nothing is looked at: the status then 
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from bricktrack_common.wire_messages import DaemonState, HealthItem
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health import machine, storage
 from bricktrack_device.health.findings import CheckResult, tried
 from bricktrack_device.health.inertial import check_adapter
+from bricktrack_device.health.self_test import run_self_test
 from bricktrack_device.interfaces import Rig
 
 logger = logging.getLogger(__name__)
@@ -47,6 +48,12 @@ class HealthWatch:
         # What cannot change while the daemon runs is looked at once.
         self._lasting: list[CheckResult] | None = None
         self._found: tuple[float, list[CheckResult]] | None = None
+        self._self_test: list[CheckResult] = []
+
+    def test_hardware(self, is_over: Callable[[], bool]) -> None:
+        """Try the hardware once, before the unit is ready; see `run_self_test`."""
+        self._self_test = run_self_test(self._config, self._rig, is_over=is_over)
+        _tell(self._self_test)
 
     def refresh_if_due(self, state: DaemonState) -> bool:
         """Look again if it is time and the unit has nothing better to do; tell whether it did."""
@@ -58,16 +65,14 @@ class HealthWatch:
         before = {} if self._found is None else {r.name: r.level for r in self._found[1]}
         results = self._look()
         self._found = now, results
-        for r in results:
-            if r.level != "ok" and before.get(r.name) != r.level:
-                logger.warning("health: %s: %s. %s", r.name, r.detail, r.remedy)
+        _tell(r for r in results if before.get(r.name) != r.level)
         return True
 
     @property
     def items(self) -> Sequence[HealthItem]:
-        """The newest findings; none before the first look. Safe from any thread."""
+        """The newest findings and the self-test's. Safe from any thread."""
         found = self._found
-        return [] if found is None else [r.as_item() for r in found[1]]
+        return [r.as_item() for r in (*(found[1] if found else ()), *self._self_test)]
 
     @property
     def age_s(self) -> float | None:
@@ -94,3 +99,9 @@ class HealthWatch:
             for imu in self._config.imu:
                 results += check_adapter(imu, described, simulated=False)
         return results
+
+
+def _tell(results: Iterable[CheckResult]) -> None:
+    for r in results:
+        if r.level != "ok":
+            logger.warning("health: %s: %s. %s", r.name, r.detail, r.remedy)

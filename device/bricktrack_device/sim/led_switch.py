@@ -61,10 +61,18 @@ class LedSwitch:
 
 
 class SimLeds:
-    """The LEDs on a simulated unit's pins, meeting `interfaces.Leds`."""
+    """The LEDs on a simulated unit's pins, meeting `interfaces.Leds`.
 
-    def __init__(self, switch: LedSwitch) -> None:
+    Parameters
+    ----------
+    switch : LedSwitch
+    lit_afterwards : bool
+        Whether they glow again when the pins are given back: those of a unit that has none on pins do.
+    """
+
+    def __init__(self, switch: LedSwitch, *, lit_afterwards: bool = True) -> None:
         self._switch: LedSwitch | None = switch
+        self._lit_afterwards = lit_afterwards
         switch.set(False, monotonic_ns())
 
     def switch(self, on: bool) -> tuple[int, int]:
@@ -76,10 +84,10 @@ class SimLeds:
         return now, monotonic_ns()
 
     def close(self) -> None:
-        """Leave the LEDs as if on their supply again. Calling it twice does no harm."""
+        """Give the pins back. Calling it twice does no harm."""
         switch, self._switch = self._switch, None
         if switch is not None:
-            switch.set(True, monotonic_ns())
+            switch.set(self._lit_afterwards, monotonic_ns())
 
     def __enter__(self) -> Self:
         """Return itself."""

@@ -45,6 +45,7 @@ class SimCamera:
         self._to_encode: queue.Queue[tuple[int, Plane] | None] = queue.Queue()
         self.frames_dropped = 0
         self._newest: Still | None = None
+        self._encoder_failed = False
 
     def start(self, sink: FrameSink) -> CameraSection:
         """Begin to stream; raise `HardwareError` if it streams already or no encoder can be had."""
@@ -64,6 +65,7 @@ class SimCamera:
         )
         encoder = VideoEncoder(s, mode.width, mode.height)
         self._stopping.clear()
+        self._encoder_failed = False
         self._to_encode = queue.Queue(_BUFFERS)
         self._threads = [
             threading.Thread(target=target, args=args, name=name, daemon=True)
@@ -88,6 +90,14 @@ class SimCamera:
     def still(self) -> Still | None:
         """Return the newest picture; `None` while none streams."""
         return self._newest
+
+    def problem(self) -> str | None:
+        """Return what is wrong with a camera that should stream, or `None`."""
+        if not self._threads:
+            return "camera: it does not stream"
+        if not all(thread.is_alive() for thread in self._threads):
+            return "camera: its thread has ended"
+        return "camera: its encoder failed; see the log" if self._encoder_failed else None
 
     def stop(self) -> None:
         """Stop streaming. Calling it twice does no harm."""
@@ -123,14 +133,13 @@ class SimCamera:
         self._to_encode.put(None)
 
     def _encode(self, encoder: VideoEncoder, chroma_u: Plane, chroma_v: Plane, sink: FrameSink) -> None:
-        broken = False
         while (item := self._to_encode.get()) is not None:
             stamp, luma = item
-            if broken:
+            if self._encoder_failed:
                 continue  # as when picamera2's encoder dies: frames stop, nothing raises
             try:
                 for packet in encoder.encode(stamp // 1000, luma, chroma_u, chroma_v):
                     sink.on_packet(packet)
             except av.error.FFmpegError:
                 logger.exception("the simulated camera's encoder failed; no more frames will come")
-                broken = True
+                self._encoder_failed = True

@@ -61,7 +61,7 @@ class SimRig:
 
     def leds(self, pins: Sequence[str], *, active_high: bool = True) -> SimLeds:
         """Return the simulated LEDs, switched off; whatever the pins are called, they hang on them."""
-        return SimLeds(self.led_switch)
+        return SimLeds(self.led_switch, lit_afterwards=not pins)
 
     def on_armed(self, t_armed_ns: int) -> None:
         """Let the table start: schedule the first edge, and drive the line from there on."""

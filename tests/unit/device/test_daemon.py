@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import zmq
-from device_fakes import FakeRig
+from device_fakes import FakeCamera, FakeRig
 
 from bricktrack_common.checksums import crc32, sha256_bytes
 from bricktrack_common.errors import DeviceError, StorageError
@@ -41,7 +41,7 @@ from bricktrack_device.daemon import Daemon
 class Unit:
     """A daemon in a thread, on fakes, and a host that speaks to it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, rig: FakeRig | None = None) -> None:
         self.config = DeviceConfig(
             unit=UnitTable(name="unit-1"),
             storage=StorageTable(folder=str(folder), margin_mb=1),
@@ -49,7 +49,7 @@ class Unit:
             recording=RecordingTable(duration_s=0.3, pre_roll_s=0.1, post_roll_s=0.1),
             imu=[],
         )
-        self.rig = FakeRig()
+        self.rig = rig or FakeRig()
         self.daemon = Daemon(self.config, self.rig)
         self.thread = threading.Thread(target=self.daemon.run)
         self.thread.start()
@@ -194,6 +194,8 @@ def test_systemd_hears_ready_watchdog_and_stopping(tmp_path: Path, monkeypatch: 
         monkeypatch.setattr("bricktrack_device.daemon.WATCHDOG_PERIOD_S", 0.05)
         unit = Unit(tmp_path / "storage")
         try:
+            assert systemd.recv(100) == b"STATUS=trying the sensors"
+            assert unit.rig.camera.n_stops == 1  # the self-test is over when the unit is ready
             assert systemd.recv(100) == b"READY=1"
             assert systemd.recv(100) == b"WATCHDOG=1\nSTATUS=idle"
         finally:
@@ -201,3 +203,12 @@ def test_systemd_hears_ready_watchdog_and_stopping(tmp_path: Path, monkeypatch: 
         messages = []
         while not messages or messages[-1] != b"STOPPING=1":
             messages.append(systemd.recv(100))
+
+
+def test_a_unit_whose_camera_failed_its_self_test_serves_and_says_so(tmp_path: Path) -> None:
+    unit = Unit(tmp_path, FakeRig(camera=FakeCamera(fail="no ribbon cable")))
+    try:
+        camera = next(i for i in unit.status().health if i.name == "self-test: camera")
+        assert camera.level == "fail" and "no ribbon cable" in camera.words and camera.remedy
+    finally:
+        unit.close()
