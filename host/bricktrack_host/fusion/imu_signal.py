@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PPoly
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.ndimage import maximum_filter1d
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag
 from bricktrack_common.rotations import matrix_from_rvec
+from bricktrack_host.fusion.running_median import running_median
 from bricktrack_host.tracks import ImuTrack
 
 MIN_SAMPLES = 20
@@ -101,8 +102,7 @@ def _off_neighbours(values: FloatArray, n_side: int) -> FloatArray:
 
 def _usual(off: FloatArray) -> FloatArray:
     """Return the sd by the running median of absolute values."""
-    window = (min(_STEADY_SAMPLES, len(off)), 1)
-    return np.asarray(median_filter(off, window, mode="nearest") / 0.6745)
+    return running_median(off, _STEADY_SAMPLES) / 0.6745
 
 
 def _bridge_clipped(t_s: FloatArray, acc: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
@@ -228,8 +228,13 @@ class ImuSignal:
         acc, clip_sd = _bridge_clipped(t_s, imu.acc_mps2[use], clip_limit)
         gyro = imu.gyro_radps[use]
         # Steady roughness before sharpening: what that adds to noise lies high, and is gone once integrated.
-        gyro_steady, acc_steady = roughness(gyro)[0], roughness(acc)[0]
-        gyro, acc = sharpened(t_s, gyro, gyro_filter_s), sharpened(t_s, acc, acc_filter_s)
+        (gyro_steady, gyro_impact), (acc_steady, acc_impact) = roughness(gyro), roughness(acc)
+        if gyro_filter_s > 0:
+            gyro = sharpened(t_s, gyro, gyro_filter_s)
+            gyro_impact = roughness(gyro)[1]
+        if acc_filter_s > 0:
+            acc = sharpened(t_s, acc, acc_filter_s)
+            acc_impact = roughness(acc)[1]
 
         interval = np.diff(t_s)
         missing = np.flatnonzero(interval > _GAP_PERIODS * period_s)
@@ -250,8 +255,8 @@ class ImuSignal:
             acc_mps2=acc,
             gyro_roughness_radps=gyro_steady,
             acc_roughness_mps2=acc_steady,
-            gyro_impact_radps=roughness(gyro)[1],
-            acc_impact_mps2=roughness(acc)[1],
+            gyro_impact_radps=gyro_impact,
+            acc_impact_mps2=acc_impact,
             gyro_bridge_radps=_usual(_off_neighbours(gyro, 2)).max(axis=1),
             acc_bridge_mps2=_usual(_off_neighbours(acc, 2)).max(axis=1),
             clip_sd_mps2=clip_sd,

@@ -9,12 +9,13 @@ sample was left out and nothing else says so.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since, usable_samples
+from bricktrack_host.fusion.running_median import running_median
+from bricktrack_host.fusion.saw_tooth_kernel import optics_cost, slip_cost
 from bricktrack_host.tracks import ImuTrack
 
 MIN_PAIRS = 60  # of frames side by side, for a search
@@ -147,6 +148,12 @@ class SawToothSearch:
         fresh = np.flatnonzero(self._fresh)
         values = np.concatenate([imu.gyro_radps[fresh], imu.acc_mps2[fresh]], axis=1)
         n = len(fresh)
+        slot = self._slot[fresh]
+        self._slip_at_s = self._mid_s + (slot + 0.5) * self.period_s
+        self._has_next = np.diff(slot, append=slot[-1]) == 1
+        self._repeat_price = np.where(
+            np.isin(fresh + 1, np.flatnonzero(self._is_repeat)), 0.0, _MISSED_REPEAT
+        )
         self._kink_gain = np.zeros(n)
         after = np.arange(4, n - 5)
         if len(after) < _KINK_WINDOW:
@@ -156,7 +163,7 @@ class SawToothSearch:
             chi2 = []
             for numbers in (_PLAIN, holed):
                 ordinary = np.abs(_departure(values, np.arange(3, n - 3), numbers, numbers))
-                spread = median_filter(ordinary, (_KINK_WINDOW, 1), mode="mirror")[rows - 3] / 0.6745
+                spread = _spread(ordinary)[rows - 3]
                 off = _departure(values, rows, _PLAIN, numbers) / (spread + 1e-9)
                 chi2.append(np.minimum((off**2).sum(axis=1), _KINK_CAP))
             self._kink_gain[after] += chi2[1] - chi2[0]
@@ -170,20 +177,25 @@ class SawToothSearch:
 
     def null_cost(self) -> float:
         """Return the least cost by optics of stamps that are right, but for an offset and a small skew."""
-        line = (self._bin_s - self._mid_s) * (np.arange(-3, 4) * 5e-5)[:, None]
-        return float(self._optics(line[:, None] + np.arange(-_SIDE_S, _SIDE_S, STEP_S)[:, None]).min())
+        # A rate without a period to wrap at is a skew.
+        lags = np.arange(-_SIDE_S, _SIDE_S, STEP_S)
+        far_s = 2 * _SIDE_S
+        return min(
+            float(self._optics(rate, np.array([far_s]), lags - far_s, period_s=1e3).min())
+            for rate in np.arange(-3, 4) * 5e-5
+        )
 
-    def _optics(self, lag_s: FloatArray) -> FloatArray:
-        """Return the cost of offsets from camera time to stamps, less the coarse one, along the last axis."""
-        column = (lag_s - self._lags_s[0]) / STEP_S
-        i = np.clip(column.astype(np.int64), 0, len(self._lags_s) - 2)
-        share = np.clip(column - i, 0.0, 1.0)
-        row = np.arange(len(self._bin_s))
-        return np.asarray(((1 - share) * self._cost[row, i] + share * self._cost[row, i + 1]).sum(axis=-1))
+    def _optics(
+        self, rate: float, phases_s: FloatArray, lags_s: FloatArray, *, period_s: float | None = None
+    ) -> FloatArray:
+        """Return the cost by optics of saw-tooths of one rate, shape (n_phases, n_lags).
 
-    def _age_s(self, t_s: FloatArray, rate: float, phase_s: FloatArray) -> FloatArray:
-        """Return the age of the samples that punctual reads at times find."""
-        return np.asarray(np.mod(phase_s - (t_s - self._mid_s) * rate, self.period_s * (1 + rate)))
+        ``lags_s``: offsets less the coarse one, beside the samples' ages; of all phases, or of each.
+        """
+        lags = np.ascontiguousarray(np.broadcast_to(lags_s, (len(phases_s), lags_s.shape[-1])))
+        period = self.period_s * (1 + rate) if period_s is None else period_s
+        since_mid = self._bin_s - self._mid_s
+        return optics_cost(self._cost, since_mid, self._lags_s[0], STEP_S, period, rate, phases_s, lags)
 
     def coarse(self) -> SawTooth:
         """Return the best saw-tooth on a grid, by optics and by repeats that never came."""
@@ -193,8 +205,7 @@ class SawToothSearch:
         lags = np.arange(-_SIDE_S, _SIDE_S + 1e-9, 2 * STEP_S) - 0.5 * self.period_s
         best = SawTooth(0.0, 0.0, 0.0, np.inf, 0.0)
         for rate in np.arange(-n, n + 1) * step:
-            age = self._age_s(self._bin_s, rate, phases[:, None])
-            cost = self._optics(age[:, None] + lags[:, None])
+            cost = self._optics(rate, phases, lags)
             cost += self._slip_cost(rate, phases, STEP_S, entices=0.0)[0][:, None]
             i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
             if cost[i, j] < best.cost:
@@ -209,7 +220,7 @@ class SawToothSearch:
             _, rate, phase, lag = best
             phases, lags = phase + width[1] * np.linspace(-1, 1, 5), lag + width[2] * np.linspace(-1, 1, 5)
             for r in rate + width[0] * np.linspace(-1, 1, 5):
-                cost = self._optics(self._age_s(self._bin_s, r, phases[:, None])[:, None] + lags[:, None])
+                cost = self._optics(r, phases, lags)
                 i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
                 best = min(best, (float(cost[i, j]), float(r), float(phases[i]), float(lags[j])))
             width *= 0.6
@@ -229,8 +240,7 @@ class SawToothSearch:
         rates = near.rate + rate_sd * np.linspace(-2, 2, 9)
         costs, read_costs, lag_at, kinks = [], [], [], []
         for rate in rates:
-            age = self._age_s(self._bin_s, rate, phases[:, None])
-            cost = self._optics(age[:, None] + lags[..., None])
+            cost = self._optics(rate, phases, lags)
             j = np.argmin(cost, axis=1)
             rows = np.arange(len(phases))
             slips, where = self._slip_cost(rate, phases, _READ_JITTER_S, entices=_KINK_TELLS)
@@ -262,37 +272,19 @@ class SawToothSearch:
         ``age_sd_s`` is how unsure the ages are. A kink where one is needed earns no more than ``entices``:
         from afar nothing, or a clock with more slips would earn by more impacts.
         """
-        fresh = np.flatnonzero(self._fresh)
-        slot = self._slot[fresh]
-        at_s = self._mid_s + (slot + 0.5) * self.period_s
-        if rate > 0:
-            price = np.where(np.isin(fresh + 1, np.flatnonzero(self._is_repeat)), 0.0, _MISSED_REPEAT)
-        else:
-            # A read that was late is spaced wrongly for reasons of its own.
-            gain = np.maximum(self._kink_gain, -entices)
-            price = np.where(np.diff(slot, append=slot[-1]) == 1, gain, 0.0)
         if abs(rate) < 1e-6:
             return np.zeros(len(phases_s)), np.zeros(len(phases_s), dtype=np.int64)
-        # The least price about each sample, rising with the distance.
+        at_s, price = self._slip_at_s, self._repeat_price
+        if rate < 0:
+            # A read that was late is spaced wrongly for reasons of its own.
+            price = np.where(self._has_next, np.maximum(self._kink_gain, -entices), 0.0)
         sd = age_sd_s / abs(rate) / self.period_s + 1.0
-        reach = int(min(3 * sd, _MOST_REACH))
-        padded = np.pad(price, reach, constant_values=np.inf)
-        near, best = np.full(len(price), np.inf), np.zeros(len(price), dtype=np.int64)
-        for k in range(2 * reach + 1):
-            here = padded[k : k + len(price)] + ((k - reach) / sd) ** 2
-            best = np.where(here < near, np.arange(len(price)) + k - reach, best)
-            near = np.minimum(near, here)
         every_s = self.period_s * (1 + rate) / rate
-        first = self._mid_s + phases_s / rate
         ends = np.sort((self._read_s[[0, -1]] - self._mid_s) / every_s)
-        k_slip = np.arange(np.floor(ends[0]) - 1, np.ceil(ends[1]) + 2)
-        slips = first[:, None] + k_slip * every_s
-        inside = (slips > at_s[0]) & (slips < at_s[-1])
-        at = np.clip(np.searchsorted(at_s, slips), 0, len(at_s) - 1)
-        cost = np.where(inside, near[at], 0.0).sum(axis=1)
-        # One number for the kinks that are used; slips at rest have none.
-        kinks = np.where(inside & (near[at] < -_KINK_IS), best[at] + 1, 0)
-        return np.asarray(cost), np.asarray((kinks * (7919 ** (np.arange(kinks.shape[1]) % 4))).sum(axis=1))
+        numbers = np.arange(np.floor(ends[0]) - 1, np.ceil(ends[1]) + 2).astype(np.int64)
+        first_s = self._mid_s + phases_s / rate
+        reach = int(min(3 * sd, _MOST_REACH))
+        return slip_cost(price, at_s, first_s, every_s, numbers, sd, reach, _KINK_IS)
 
     def _repeat_cost(self, rate: float, phases_s: FloatArray) -> FloatArray:
         """Return what reads that found, or did not find, the sample before say of phases.
@@ -342,6 +334,13 @@ class SawToothSearch:
         for j in range(len(number) - 1, 0, -1):
             path[j - 1] = came[j, path[j]]
         return np.asarray(np.maximum.accumulate(number[np.arange(len(number)), path]))
+
+
+def _spread(values: FloatArray) -> FloatArray:
+    """Return the sd nearby, by the running median; the ends mirrored."""
+    half = _KINK_WINDOW // 2
+    mirrored = np.pad(values, ((half, half), (0, 0)), mode="reflect")
+    return running_median(mirrored, _KINK_WINDOW)[half:-half] / 0.6745
 
 
 def _departure(

@@ -1,0 +1,92 @@
+"""The loops of `saw_tooth`, compiled: what optics and reads say of many saw-tooths."""
+
+import numpy as np
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_host.compiled import compiled
+
+
+@compiled
+def optics_cost(
+    table: FloatArray,
+    since_mid_s: FloatArray,
+    first_lag_s: float,
+    lag_step_s: float,
+    period_s: float,
+    rate: float,
+    phases_s: FloatArray,
+    lags_s: FloatArray,
+) -> FloatArray:
+    """Return the cost of saw-tooths of one rate by the optical rotations, shape (n_phases, n_lags).
+
+    Parameters
+    ----------
+    table : ndarray, shape (n_bins, n_table_lags)
+        Cost of each stretch of time over offsets of camera time to stamps, from ``first_lag_s`` on.
+    since_mid_s : ndarray, shape (n_bins,)
+        The stretches' middles.
+    period_s : float
+        The sensor's.
+    phases_s : ndarray, shape (n_phases,)
+    lags_s : ndarray, shape (n_phases, n_lags)
+        Offsets to be added to the samples' ages.
+    """
+    n_bins, n_table = table.shape
+    out = np.zeros(lags_s.shape)
+    for i in range(lags_s.shape[0]):
+        for m in range(n_bins):
+            age = (phases_s[i] - since_mid_s[m] * rate) % period_s
+            for j in range(lags_s.shape[1]):
+                column = (age + lags_s[i, j] - first_lag_s) / lag_step_s
+                at = min(max(int(column), 0), n_table - 2)
+                share = min(max(column - at, 0.0), 1.0)
+                out[i, j] += (1.0 - share) * table[m, at] + share * table[m, at + 1]
+    return out
+
+
+@compiled
+def slip_cost(
+    price: FloatArray,
+    at_s: FloatArray,
+    first_slips_s: FloatArray,
+    every_s: float,
+    numbers: IntArray,
+    sd_samples: float,
+    reach: int,
+    kink_is: float,
+) -> tuple[FloatArray, IntArray]:
+    """Return what the slips of saw-tooths cost, and one number for the kinks that each makes use of.
+
+    Parameters
+    ----------
+    price : ndarray, shape (n,)
+        Of a slip at each sample; away from it the price rises with the square of the distance over
+        ``sd_samples``, up to ``reach`` samples.
+    at_s : ndarray, shape (n,)
+        When the samples were read, rising.
+    first_slips_s : ndarray, shape (n_phases,)
+        Slip number 0 of each saw-tooth.
+    every_s : float
+        From one slip to the next; may be negative.
+    numbers : ndarray of int64, shape (n_slips,)
+    kink_is : float
+        Below minus this a price is that of a kink.
+    """
+    n = len(at_s)
+    cost, kinks = np.zeros(len(first_slips_s)), np.zeros(len(first_slips_s), dtype=np.int64)
+    for p in range(len(first_slips_s)):
+        weight = 1
+        for i in range(len(numbers)):
+            slip = first_slips_s[p] + numbers[i] * every_s
+            if at_s[0] < slip < at_s[n - 1]:
+                centre = np.searchsorted(at_s, slip)
+                least, best = np.inf, 0
+                for k in range(max(centre - reach, 0), min(centre + reach + 1, n)):
+                    here = price[k] + ((k - centre) / sd_samples) ** 2
+                    if here < least:
+                        least, best = here, k
+                cost[p] += least
+                if least < -kink_is:
+                    kinks[p] += (best + 1) * weight
+            weight = weight * 7919 if i % 4 != 3 else 1
+    return cost, kinks
