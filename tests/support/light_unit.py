@@ -2,12 +2,17 @@
 
 ``python light_unit.py STORAGE`` arms itself, is triggered by a wave of its own soon after, records for half a
 second, saves and arms itself again, until it is ended. Its video has the size that a real one has.
+With ``--idle`` it only serves what is on its card; with ``--port N`` on this port.
 """
 
+import argparse
+import contextlib
 import logging
+import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from device_fakes import FakeBusOpener, FakeCamera, FakeRig
@@ -31,15 +36,15 @@ DURATION_S = 0.5
 WAVE_HZ = 100.0
 
 
-def light_config(storage: Path) -> DeviceConfig:
+def light_config(storage: Path, *, auto_arm: bool = True, port: int = 0) -> DeviceConfig:
     """Return what such a unit is told."""
     return DeviceConfig(
         unit=UnitTable(name="light"),
         storage=StorageTable(folder=str(storage), margin_mb=1),
-        server=ServerTable(port=0),
+        server=ServerTable(port=port),
         trigger=TriggerTable(nominal_hz=WAVE_HZ),
         recording=RecordingTable(
-            duration_s=DURATION_S, pre_roll_s=0.1, post_roll_s=0.1, auto_arm=True, label="light"
+            duration_s=DURATION_S, pre_roll_s=0.1, post_roll_s=0.1, auto_arm=auto_arm, label="light"
         ),
         imu=[ImuTable(name="brick", bus="a")],
         sampler=SamplerTable(priority=0, lock_memory=False),
@@ -66,6 +71,34 @@ class SelfDrivenRig(FakeRig):
             pin.drive_at(k % 2 == 0, t_ns * 1e-9)
 
 
+@contextlib.contextmanager
+def idle_unit(storage: Path, *, port: int = 0) -> Iterator[str]:
+    """Run such a unit, idle, in its own process; yield its address."""
+    command = [sys.executable, __file__, str(storage), "--idle", "--port", str(port)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        yield f"tcp://127.0.0.1:{read_port(process)}"
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def read_port(process: subprocess.Popen[str]) -> int:
+    """Return the port that a unit says it serves on; what else it logs is passed over."""
+    seen = []
+    for line in process.stderr or ():
+        seen.append(line)
+        if " port " in line:
+            return int(line.split(" port ")[1].split(";")[0])
+    raise RuntimeError("the unit ended: " + "".join(seen))
+
+
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("storage", type=Path)
+    parser.add_argument("--idle", action="store_true")
+    parser.add_argument("--port", type=int, default=0)
+    options = parser.parse_args()
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
-    Daemon(light_config(Path(sys.argv[1])), SelfDrivenRig()).run()
+    config = light_config(options.storage, auto_arm=not options.idle, port=options.port)
+    Daemon(config, SelfDrivenRig()).run()

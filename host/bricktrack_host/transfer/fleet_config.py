@@ -1,6 +1,7 @@
 """``fleet.toml``: which units there are, where they are reached, and what belongs to each."""
 
 import re
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
@@ -13,6 +14,7 @@ from bricktrack_common.typed_data import load_toml
 from bricktrack_common.wire_messages import HelloReply
 
 CameraMount = Literal["static", "imu", "table"]
+_ServerKey = Annotated[str, msgspec.Meta(pattern=r"^([0-9A-Za-z.:+=^!/*?&<>()\[\]{}@%$#-]{40})?$")]  # Z85
 
 
 class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -21,9 +23,13 @@ class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     Attributes
     ----------
     name : str
-        As in the unit's own configuration; run ids begin with it.
+        As in the unit's own configuration; run ids begin with it. With ``server_key`` it is the unit's
+        identity: an address is only where it was last found.
     address : str
-        ``tcp://host:port``.
+        ``tcp://host:port``; ``""`` for a unit that is found by its name (mDNS).
+    server_key : str
+        The unit's public key, 40 characters (Z85), as ``bricktrackd`` tells it; ``""`` for a unit without
+        keys, which is reached on a loopback address only.
     calibration, layout : str, path, relative to the fleet file
         The camera's calibration and the brick's LED layout; ``""`` if not given.
     camera : "static", "imu" or "table"
@@ -31,7 +37,8 @@ class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """
 
     name: Annotated[str, msgspec.Meta(pattern=RUN_ID_PATTERN)]
-    address: str
+    address: str = ""
+    server_key: _ServerKey = ""
     calibration: str = ""
     layout: str = ""
     camera: CameraMount = "static"
@@ -47,11 +54,29 @@ class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return Path(self.layout) if self.layout else None
 
 
+class HostTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[host]``: this machine's own side.
+
+    Attributes
+    ----------
+    secret_key : str, path, relative to the fleet file
+        The file of this host's secret key; ``""`` where no unit has keys.
+    """
+
+    secret_key: str = ""
+
+    @property
+    def secret_key_path(self) -> Path | None:
+        """The key file, if one is named."""
+        return Path(self.secret_key) if self.secret_key else None
+
+
 class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The units of a laboratory and the folder that their runs go to."""
+    """The units of a laboratory, the folder that their runs go to, and this host's key."""
 
     unit: Annotated[list[UnitConfig], msgspec.Meta(min_length=1)]
     runs_folder: str = "runs"
+    host: HostTable = HostTable()
 
     @property
     def runs_path(self) -> Path:
@@ -59,20 +84,23 @@ class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return Path(self.runs_folder)
 
     def select(self, names: list[str] | None) -> list[UnitConfig]:
-        """Return the units of these names in the fleet's order, or all of them.
+        """Return the units of these names or patterns (``c-*``) in the fleet's order, or all of them.
 
         Raises
         ------
         ConfigError
-            If there is no unit of a name.
+            If no unit is meant by one of them.
         """
         if not names:
             return list(self.unit)
-        known = [u.name for u in self.unit]
         for name in names:
-            if name not in known:
-                raise ConfigError(f"no unit {name!r} in the fleet; there are {', '.join(known)}")
-        return [u for u in self.unit if u.name in names]
+            if not any(fnmatchcase(u.name, name) for u in self.unit):
+                raise ConfigError(f"no unit {name!r} in the fleet; there are {self._some_names()}")
+        return [u for u in self.unit if any(fnmatchcase(u.name, name) for name in names)]
+
+    def _some_names(self, n: int = 12) -> str:
+        more = f" and {len(self.unit) - n} more" if len(self.unit) > n else ""
+        return ", ".join(u.name for u in self.unit[:n]) + more
 
 
 def load_fleet(path: Path) -> Fleet:
@@ -81,30 +109,43 @@ def load_fleet(path: Path) -> Fleet:
     Raises
     ------
     ConfigError
-        If it cannot be read, has an unknown, missing or wrong key, or a name or address twice.
+        If it cannot be read, has an unknown, missing or wrong key, a name, address or server key twice, or
+        server keys without this host's own.
     """
     fleet = load_toml(path, Fleet)
     base = path.resolve().parent
-    names: set[str] = set()
-    addresses: set[str] = set()
+    seen: dict[str, set[str]] = {"name": set(), "address": set(), "server_key": set()}
     units: list[UnitConfig] = []
     for i, unit in enumerate(fleet.unit):
         where = f"{path}: unit[{i}]"
-        check_address(unit.address, where=f"{where}.address")
-        if unit.name in names:
-            raise ConfigError(f"{where}.name: {unit.name!r} stands twice")
-        if unit.address in addresses:
-            raise ConfigError(f"{where}.address: {unit.address!r} stands twice")
-        names.add(unit.name)
-        addresses.add(unit.address)
+        if unit.address:
+            check_address(unit.address, where=f"{where}.address")
+        for key, values in seen.items():
+            value = getattr(unit, key)
+            if value and value in values:
+                raise ConfigError(f"{where}.{key}: {value!r} stands twice")
+            values.add(value)
         units.append(
             msgspec.structs.replace(
                 unit,
-                calibration=str(base / unit.calibration) if unit.calibration else "",
-                layout=str(base / unit.layout) if unit.layout else "",
+                calibration=_below(base, unit.calibration),
+                layout=_below(base, unit.layout),
             )
         )
-    return Fleet(unit=units, runs_folder=str(base / fleet.runs_folder))
+        if unit.server_key and not fleet.host.secret_key:
+            raise ConfigError(
+                f"{where}.server_key: the unit asks who we are, and {path} names no key of this host. Make one "
+                "with 'bricktrack keys create' and name it under [host] as secret_key = \"...\""
+            )
+    return Fleet(
+        unit=units,
+        runs_folder=_below(base, fleet.runs_folder),
+        host=HostTable(secret_key=_below(base, fleet.host.secret_key)),
+    )
+
+
+def _below(base: Path, path: str) -> str:
+    return str(base / Path(path).expanduser()) if path else ""
 
 
 def unit_at(address: str) -> UnitConfig:
@@ -124,7 +165,7 @@ def check_name(hello: HelloReply, unit: UnitConfig) -> None:
     if unit.name not in (hello.unit, _name_of_address(unit.address)):
         raise ConfigError(
             f"the unit at {unit.address} calls itself {hello.unit!r}; the fleet file calls it {unit.name!r}. "
-            "Put the addresses right in fleet.toml"
+            "Put the addresses right in fleet.toml; 'bricktrack find' tells where each unit is"
         )
 
 

@@ -1,29 +1,35 @@
 """The folder of a run under way, ``<run-id>.part/``: files with holes, and a journal of what is verified.
 
 The journal is JSON lines: first what is being fetched, then one line for every verified range with its
-checksum, written only after the range's bytes are on the disk. A journal cut in the middle of a line, as a
-kill or a power cut leaves it, loses that line.
+checksum, written behind the range's bytes. Nothing in it is believed without a look at those bytes: whoever
+opens the folder again reads every range and compares, so that a power cut that lost bytes, or tore a line,
+costs only those ranges. A killed pull loses nothing but the chunks that were on the network.
+
+While bytes come in, one thread behind each folder hashes what lies there without a gap, as read back from the
+file, and syncs it, so that little is left to do when the last chunk is here.
 """
 
 import fcntl
+import hashlib
 import os
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
 
 import msgspec
 
-from bricktrack_common.checksums import crc32, sha256_file
+from bricktrack_common.checksums import crc32
 from bricktrack_common.errors import StorageError
 from bricktrack_common.wire_messages import RunDescription
 from bricktrack_host.durable_files import rename_durably, sync_folder, write_durably
 
 JOURNAL_NAME = ".journal.jsonl"  # begins with a dot, which no file of a run may
 JOURNAL_VERSION = 1
-_FLUSH_BYTES = 4 * 1024 * 1024
+_SETTLE_BYTES = 16 * 1024 * 1024  # hashed and synced at a time, behind the transfer
+_READ_BYTES = 1024 * 1024
 
 
 class _Head(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -42,11 +48,52 @@ class _Range(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     crc32: int
 
 
-@dataclass(slots=True)
-class _OpenFile:
-    handle: BinaryIO
-    n_bytes: int
-    verified: list[_Range] = field(default_factory=list)
+class _PartFile:
+    """One file with holes: which ranges are verified, and the hash of what lies before the first hole."""
+
+    def __init__(self, path: Path, n_bytes: int) -> None:
+        self.handle: BinaryIO = os.fdopen(
+            os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644), "r+b", 0
+        )
+        if os.fstat(self.handle.fileno()).st_size > n_bytes:
+            self.handle.truncate(n_bytes)
+        self.n_bytes = n_bytes
+        self.verified: list[_Range] = []
+        self.n_bytes_verified = 0
+        self.n_bytes_without_gap = 0
+        self.n_bytes_settling = 0
+        self._ends_ahead: dict[int, int] = {}  # behind the first hole: the end of a range by its start
+        self._digest = hashlib.sha256()
+        self._n_bytes_hashed = 0
+
+    def add(self, done: _Range) -> None:
+        """Note a verified range; it overlaps no other."""
+        self.verified.append(done)
+        self.n_bytes_verified += done.n_bytes
+        self._ends_ahead[done.offset] = done.offset + done.n_bytes
+        while (end := self._ends_ahead.pop(self.n_bytes_without_gap, None)) is not None:
+            self.n_bytes_without_gap = end
+
+    def overlaps(self, other: _Range) -> bool:
+        """Tell whether a verified range covers a part of another one."""
+        end = other.offset + other.n_bytes
+        return any(r.offset < end and other.offset < r.offset + r.n_bytes for r in self.verified)
+
+    def settle(self, end: int) -> None:
+        """Hash the file up to ``end`` as it is on disk, and sync it; for one thread only."""
+        while self._n_bytes_hashed < end:
+            data = os.pread(
+                self.handle.fileno(), min(_READ_BYTES, end - self._n_bytes_hashed), self._n_bytes_hashed
+            )
+            if not data:
+                break  # cut short behind our back: the hash will tell
+            self._digest.update(data)
+            self._n_bytes_hashed += len(data)
+        os.fsync(self.handle.fileno())
+
+    def sha256(self) -> str:
+        """Return the hash of what has settled, as 64 hex digits."""
+        return self._digest.hexdigest()
 
 
 class PartFolder:
@@ -57,8 +104,9 @@ class PartFolder:
         self._description = description
         self._lock = lock
         self._journal: BinaryIO | None = None
-        self._files: dict[str, _OpenFile] = {}
-        self._unflushed: list[_Range] = []
+        self._files: dict[str, _PartFile] = {}
+        self._behind = ThreadPoolExecutor(1, f"settle-{description.run_id}")
+        self._settling: list[Future[None]] = []
 
     @classmethod
     def open(cls, path: Path, description: RunDescription, *, note: Callable[[str], None]) -> Self:
@@ -92,13 +140,11 @@ class PartFolder:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            with suppress(OSError):  # the first error is the one to tell
-                self.flush()
         self.close()
 
     def close(self) -> None:
-        """Close all files; what was not flushed is fetched again next time."""
+        """Close all files; what was written and noted is still there next time."""
+        self._behind.shutdown()
         for file in self._files.values():
             with suppress(OSError):
                 file.handle.close()
@@ -110,7 +156,7 @@ class PartFolder:
     @property
     def n_bytes_verified(self) -> int:
         """Bytes of the run that are here and verified."""
-        return sum(r.n_bytes for f in self._files.values() for r in f.verified)
+        return sum(f.n_bytes_verified for f in self._files.values())
 
     @property
     def n_bytes_missing(self) -> int:
@@ -132,45 +178,47 @@ class PartFolder:
         return chunks
 
     def write(self, name: str, offset: int, data: bytes) -> None:
-        """Write a verified chunk; every 4 MiB all is made durable and noted in the journal."""
+        """Write a verified chunk and note it in the journal."""
         file = self._files[name]
         write_at(file.handle, offset, data)
         done = _Range(file=name, offset=offset, n_bytes=len(data), crc32=crc32(data))
-        file.verified.append(done)
-        self._unflushed.append(done)
-        if sum(r.n_bytes for r in self._unflushed) >= _FLUSH_BYTES:
-            self.flush()
-
-    def flush(self) -> None:
-        """Make all written bytes durable, then the journal that vouches for them."""
-        if not self._unflushed:
-            return
-        for name in {r.file for r in self._unflushed}:
-            os.fsync(self._files[name].handle.fileno())
         if self._journal is not None:
-            self._journal.write(b"".join(msgspec.json.encode(r) + b"\n" for r in self._unflushed))
-            os.fsync(self._journal.fileno())
-        self._unflushed.clear()
+            self._journal.write(msgspec.json.encode(done) + b"\n")
+        file.add(done)
+        if file.n_bytes_without_gap >= file.n_bytes_settling + _SETTLE_BYTES:
+            self._settle(file)
 
     def sha256(self, name: str) -> str:
-        """Return the hash of a file as it is on disk."""
-        return sha256_file(self.path / name)
+        """Return the hash of a file as it is on disk, and synced; waits until it is."""
+        file = self._files[name]
+        self._settle(file)
+        self._wait_until_settled()
+        return file.sha256()
+
+    def _settle(self, file: _PartFile) -> None:
+        file.n_bytes_settling = file.n_bytes_without_gap
+        self._settling.append(self._behind.submit(file.settle, file.n_bytes_settling))
+
+    def _wait_until_settled(self) -> None:
+        settling, self._settling = self._settling, []
+        for work in settling:
+            work.result()
 
     def set_aside(self, name: str) -> Path:
         """Keep a wrong file beside the folder, as ``<run-id>.bad-N.<name>``, and begin it anew."""
+        self._wait_until_settled()
         old = self._files.pop(name)
         old.handle.close()
-        self._unflushed = [r for r in self._unflushed if r.file != name]
         evidence = _free_name(self.path.with_suffix(""), ending=f".{name}")
         (self.path / name).rename(evidence)
         sync_folder(self.path.parent)
-        self._files[name] = self._open_file(name, old.n_bytes)
+        self._files[name] = _PartFile(self.path / name, old.n_bytes)
         self._rewrite_journal()
         return evidence
 
     def finish(self) -> None:
         """Make everything durable, the names too; the folder may then be renamed."""
-        self.flush()
+        self._wait_until_settled()
         sync_folder(self.path)
 
     @staticmethod
@@ -180,14 +228,14 @@ class PartFolder:
 
     def _resume(self, note: Callable[[str], None]) -> None:
         for file in self._description.files:
-            self._files[file.name] = self._open_file(file.name, file.n_bytes)
+            self._files[file.name] = _PartFile(self.path / file.name, file.n_bytes)
         n_wrong = 0
         for line in _read_journal(self.path / JOURNAL_NAME)[1:]:
             known = _parse_range(line)
             if known is None or known.file not in self._files or not self._still_there(known):
                 n_wrong += 1
                 continue
-            self._files[known.file].verified.append(known)
+            self._files[known.file].add(known)
         if n_wrong:
             note(f"{self.path.name}: {n_wrong} ranges noted earlier are not as noted; they are fetched again")
         self._rewrite_journal()
@@ -197,20 +245,13 @@ class PartFolder:
         if known.offset < 0 or known.n_bytes < 1 or known.offset + known.n_bytes > file.n_bytes:
             return False
         data = os.pread(file.handle.fileno(), known.n_bytes, known.offset)
-        return len(data) == known.n_bytes and crc32(data) == known.crc32
-
-    def _open_file(self, name: str, n_bytes: int) -> _OpenFile:
-        handle = os.fdopen(os.open(self.path / name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644), "r+b", 0)
-        if os.fstat(handle.fileno()).st_size > n_bytes:
-            handle.truncate(n_bytes)
-        return _OpenFile(handle, n_bytes)
+        return len(data) == known.n_bytes and crc32(data) == known.crc32 and not file.overlaps(known)
 
     def _rewrite_journal(self) -> None:
-        """Begin the journal anew with what is durable; the old one stays until it is whole."""
+        """Begin the journal anew with what is verified; the old one stays until it is whole."""
         if self._journal is not None:
             self._journal.close()
-        unflushed = {id(r) for r in self._unflushed}
-        ranges = [r for f in self._files.values() for r in f.verified if id(r) not in unflushed]
+        ranges = [r for f in self._files.values() for r in f.verified]
         fresh = self.path / f"{JOURNAL_NAME}.new"
         fresh.unlink(missing_ok=True)
         head = _Head(journal=JOURNAL_VERSION, description=self._description)

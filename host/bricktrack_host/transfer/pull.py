@@ -236,7 +236,6 @@ class _RunTransfer:
                     self._tell(part.n_bytes_verified)
             except TransferError as e:
                 raise TransferError(f"{self.run_id}: {file.name}: {e}") from e
-            part.flush()
             found = part.sha256(file.name)
             if found == file.sha256:
                 return

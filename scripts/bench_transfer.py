@@ -1,0 +1,124 @@
+"""How fast one run comes over loopback, beside ``cp`` and a plain TCP copy of the same file.
+
+A real daemon (simulated sensors) in its own process serves a run with one large file; the host's own pull brings
+it: chunks with checksums, a journal of what is on the disk, the file's hash, and names that survive a power cut.
+The peers do less: ``cp`` with a sync, one TCP connection with a sync, and the latter with the SHA-256 that tells
+whether the copy is right. All take turns in one run, on one disk; a ratio is the peer's time by the pull's, so
+that 0.5 is half the peer's speed.
+
+    python scripts/bench_transfer.py --megabytes 200 --repeats 5
+"""
+
+import argparse
+import contextlib
+import hashlib
+import os
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "tests" / "support"))
+
+from light_unit import idle_unit  # noqa: E402 (the tests' support is no package)
+from run_folders import make_run  # noqa: E402
+
+from bricktrack_host.transfer.pull import pull_run  # noqa: E402
+from bricktrack_host.transfer.unit_client import UnitClient  # noqa: E402
+
+MB = 1_000_000
+RUN = "light_0001"
+TCP_SENDER = (
+    "import socket, sys\n"
+    "server = socket.create_server(('127.0.0.1', 0))\n"
+    "print(server.getsockname()[1], flush=True)\n"
+    "while True:\n"
+    "    peer, _ = server.accept()\n"
+    "    with peer, open(sys.argv[1], 'rb') as file:\n"
+    "        peer.sendfile(file)\n"
+)
+
+
+@contextlib.contextmanager
+def tcp_sender(path: Path) -> Iterator[int]:
+    """Send a file to whoever connects, from another process; yield the port."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", TCP_SENDER, str(path)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None  # noqa: S101 (it was asked for)
+        yield int(process.stdout.readline())
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def copy_by_cp(source: Path, target: Path) -> None:
+    subprocess.run(["cp", source, target], check=True)
+    with target.open("rb+") as file:
+        os.fsync(file.fileno())
+
+
+def copy_by_tcp(port: int, target: Path, *, sha256: bool) -> None:
+    buffer = memoryview(bytearray(256 * 1024))
+    digest = hashlib.sha256()
+    with socket.create_connection(("127.0.0.1", port)) as peer, target.open("wb", buffering=0) as file:
+        while n := peer.recv_into(buffer):
+            file.write(buffer[:n])
+            if sha256:
+                digest.update(buffer[:n])
+        os.fsync(file.fileno())
+
+
+def seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--megabytes", type=int, default=200)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument(
+        "--folder", type=Path, help="on the disk to be measured [default: the temporary folder]"
+    )
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="bench-transfer-", dir=options.folder) as name:
+        measure(Path(name), options.megabytes * MB, options.repeats)
+
+
+def measure(folder: Path, n_bytes: int, repeats: int) -> None:
+    source = make_run(folder / "card" / "runs", RUN, {"video.h264": n_bytes}, unit="light") / "video.h264"
+    here = folder / "here"
+    here.mkdir()
+    times: dict[str, list[float]] = {}
+    with idle_unit(folder / "card") as address, tcp_sender(source) as port:
+        ways: dict[str, Callable[[], object]] = {
+            "pull": lambda: pull_run(lambda: UnitClient(address), RUN, here),
+            "cp, synced": lambda: copy_by_cp(source, here / "cp"),
+            "TCP, synced": lambda: copy_by_tcp(port, here / "tcp", sha256=False),
+            "TCP, synced and hashed": lambda: copy_by_tcp(port, here / "tcp", sha256=True),
+        }
+        for _ in range(repeats):
+            for way, work in ways.items():
+                times.setdefault(way, []).append(seconds(work))
+                for path in here.iterdir():
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    print(f"{n_bytes / MB:.0f} MB over loopback, medians of {repeats} turns (simulated unit, one machine):")
+    median = {way: statistics.median(spent) for way, spent in times.items()}
+    for way, spent in median.items():
+        ratio = "" if way == "pull" else f"   pull is {spent / median['pull']:.2f} of its speed"
+        print(f"  {way:24} {n_bytes / MB / spent:7.0f} MB/s{ratio}")
+
+
+if __name__ == "__main__":
+    main()
