@@ -1,7 +1,8 @@
 """The wire protocol's messages, as types that are checked before anything believes them.
 
-A message is one msgpack map ``{"protocol": 1, "request_id": n, "body": {"type": ..., ...}}``; file bytes
-travel behind it as a raw ZeroMQ frame, never inside. `docs/wire-protocol.md` describes each message.
+A message is one msgpack map ``{"protocol": 2, "minor": 0, "request_id": n, "body": {"type": ..., ...}}``;
+file bytes travel behind it as raw ZeroMQ frames, never inside. `docs/wire-protocol.md` describes each
+message, and what may change within a version.
 """
 
 from typing import Annotated, Literal, TypeVar
@@ -11,12 +12,18 @@ import msgspec
 
 from bricktrack_common.clocks import ClockTriplet
 from bricktrack_common.errors import ProtocolError
+from bricktrack_common.newer_fields import without_unknown_fields
 from bricktrack_common.run_manifest import FILE_NAME_PATTERN, RUN_ID_PATTERN
 from bricktrack_common.typed_data import convert
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
+"""Both ends must speak the same; it changes when an older reader would misunderstand a newer writer."""
+PROTOCOL_MINOR = 0
+"""Counts what was added since: optional fields and new requests."""
 MAX_HEADER_BYTES = 64 * 1024
 MAX_CHUNK_BYTES = 1024 * 1024
+"""The longest raw frame; longer data, a still's, are cut into several."""
+MAX_STILL_BYTES = 16 * 1024 * 1024
 DEFAULT_PORT = 41733
 
 _RunId = Annotated[str, msgspec.Meta(pattern=RUN_ID_PATTERN)]
@@ -29,14 +36,26 @@ DaemonState = Literal["idle", "armed", "recording", "saving", "fault"]
 HealthLevel = Literal["ok", "warn", "fail"]
 ErrorCode = Literal[
     "bad-message", "bad-version", "busy", "no-such-run", "no-such-file", "out-of-range", "hash-mismatch",
-    "no-space", "not-ready", "wrong-state", "internal",
+    "no-space", "not-ready", "wrong-state", "internal", "bad-value", "not-confirmed", "too-many",
 ]  # fmt: skip
+StillEncoding = Literal["png", "jpeg"]
+ConfigValue = bool | int | float | str | list[float] | None
+"""One value of a unit's configuration; `None` stands for what the unit's own file says."""
+ConfigValues = Annotated[
+    dict[Annotated[str, msgspec.Meta(max_length=64)], ConfigValue], msgspec.Meta(max_length=64)
+]
 
 
 class _Body(
-    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag=str.lower
+    msgspec.Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    tag_field="type",
+    tag=str.lower,
 ):
-    """Base of all bodies; the type's name in lower case is its tag."""
+    """Base of all bodies. What is at its default stays out: an older reader need not know the field."""
 
 
 # Requests, host to unit.
@@ -92,7 +111,37 @@ class Confirm(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag=
     sha256: Annotated[list[_Sha256], msgspec.Meta(max_length=64)]
 
 
-Request = Hello | GetStatus | Arm | Disarm | ListRuns | DescribeRun | Read | Confirm
+class DeleteRun(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="delete"):
+    """Remove a run from the unit's card: one that a host has confirmed, or any with ``force``."""
+
+    run_id: _RunId
+    force: bool = False
+
+
+class TakeStill(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="still"):
+    """Take a picture for aiming, focus and calibration, while the unit is idle.
+
+    ``png`` is the luma plane as the camera gave it, grey, without loss; ``jpeg`` is smaller and in colour.
+    ``lit`` switches the LEDs on for it, where they hang on the unit's pins.
+    """
+
+    encoding: StillEncoding = "png"
+    lit: bool = True
+
+
+class Configure(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="configure"):
+    """Change values of the unit's configuration, for good; without values only ask what they are.
+
+    Keys are dotted, ``camera.exposure_us``; `None` goes back to what the unit's own file says.
+    """
+
+    values: ConfigValues = {}
+
+
+Request = (
+    Hello | GetStatus | Arm | Disarm | ListRuns | DescribeRun | Read | Confirm | DeleteRun | TakeStill
+    | Configure
+)  # fmt: skip
 
 
 # Replies, unit to host.
@@ -125,6 +174,15 @@ class HealthItem(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     remedy: _Words = ""
 
 
+class CameraStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the camera is set."""
+
+    mode: Annotated[str, msgspec.Meta(max_length=64)]
+    exposure_us: _Count
+    analogue_gain: float
+    frame_rate_hz: float
+
+
 class StatusReply(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="status-reply"):
     """How the unit is."""
 
@@ -145,6 +203,9 @@ class StatusReply(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, 
     health: Annotated[list[HealthItem], msgspec.Meta(max_length=64)] = []
     health_age_s: Annotated[float, msgspec.Meta(ge=0)] | None = None
     clocks: ClockTriplet
+    runs_unconfirmed: _Count | None = None
+    auto_arm: bool = False
+    camera: CameraStatus | None = None
 
 
 class Armed(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="armed"):
@@ -204,6 +265,42 @@ class Confirmed(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, ta
     run_id: _RunId
 
 
+class Deleted(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="deleted"):
+    """The run is gone from the card, and this much room came free."""
+
+    run_id: _RunId
+    n_bytes: _Count
+
+
+class StillImage(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="still-image"):
+    """A picture; its bytes are the next frames of the message, together ``n_bytes`` long.
+
+    ``lit`` tells whether the LEDs were switched on for it, `None` where they hang on no pins. ``taken_ns`` is
+    CLOCK_MONOTONIC when the picture was asked of the camera.
+    """
+
+    encoding: StillEncoding
+    width_px: _Count
+    height_px: _Count
+    n_bytes: Annotated[int, msgspec.Meta(ge=1, le=MAX_STILL_BYTES)]
+    crc32: Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
+    model: _Words
+    mode: Annotated[str, msgspec.Meta(max_length=64)]
+    exposure_us: _Count
+    analogue_gain: float
+    colour_gains: tuple[float, float]
+    lit: bool | None
+    taken_ns: _Count
+    simulated: bool
+
+
+class Configured(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="configured"):
+    """What can be configured from here, as it is now; ``changed`` are the keys that a host has set."""
+
+    values: ConfigValues
+    changed: Annotated[list[Annotated[str, msgspec.Meta(max_length=64)]], msgspec.Meta(max_length=64)] = []
+
+
 class Refusal(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="refusal"):
     """The unit does not do what was asked, and says why."""
 
@@ -211,39 +308,67 @@ class Refusal(_Body, frozen=True, kw_only=True, forbid_unknown_fields=True, tag=
     message: _Words
 
 
-Reply = HelloReply | StatusReply | Armed | Disarmed | RunList | RunDescription | Chunk | Confirmed | Refusal
+Reply = (
+    HelloReply | StatusReply | Armed | Disarmed | RunList | RunDescription | Chunk | Confirmed | Deleted
+    | StillImage | Configured | Refusal
+)  # fmt: skip
 
 _Body_T = TypeVar("_Body_T")
 
 
 class _RequestEnvelope(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     protocol: int
+    minor: _Count
     request_id: _Count
     body: Request
 
 
 class _ReplyEnvelope(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     protocol: int
+    minor: _Count
     request_id: _Count
     body: Reply
 
 
 def encode_message(request_id: int, body: Request | Reply) -> bytes:
     """Return the msgpack header of one request or reply."""
-    envelope = {"protocol": PROTOCOL_VERSION, "request_id": request_id, "body": msgspec.to_builtins(body)}
+    envelope = {
+        "protocol": PROTOCOL_VERSION,
+        "minor": PROTOCOL_MINOR,
+        "request_id": request_id,
+        "body": msgspec.to_builtins(body),
+    }
     packed: bytes = msgpack.packb(envelope)
     return packed
 
 
 def decode_request(data: bytes) -> tuple[int, Request]:
-    """Return the id and body of a request; raise `ProtocolError` on anything else."""
-    envelope = _decode(data, _RequestEnvelope)
+    """Return the id and body of a request; raise `ProtocolError` on anything else.
+
+    A unit must not half obey: what it does not know in a request is refused, from newer hosts too.
+    """
+    if len(data) > MAX_HEADER_BYTES:
+        raise ProtocolError(f"message header of {len(data)} bytes; at most {MAX_HEADER_BYTES} are allowed")
+    message, minor = _unpack(data)
+    try:
+        envelope = convert(message, _RequestEnvelope, where="message", error=ProtocolError)
+    except ProtocolError as e:
+        raise _explained(e, minor) from e
     return envelope.request_id, envelope.body
 
 
 def decode_reply(data: bytes) -> tuple[int, Reply]:
-    """Return the id and body of a reply; raise `ProtocolError` on anything else."""
-    envelope = _decode(data, _ReplyEnvelope)
+    """Return the id and body of a reply; raise `ProtocolError` on anything else.
+
+    A unit of a newer minor version may tell more than this host knows: such fields are left out.
+    """
+    message, minor = _unpack(data)
+    if minor > PROTOCOL_MINOR:
+        message = without_unknown_fields(message, _ReplyEnvelope)
+    try:
+        envelope = convert(message, _ReplyEnvelope, where="message", error=ProtocolError)
+    except ProtocolError as e:
+        raise _explained(e, minor) from e
     return envelope.request_id, envelope.body
 
 
@@ -251,9 +376,8 @@ class VersionError(ProtocolError):
     """The other side speaks another version of the protocol."""
 
 
-def _decode(data: bytes, kind: type[_Body_T]) -> _Body_T:
-    if len(data) > MAX_HEADER_BYTES and kind is _RequestEnvelope:
-        raise ProtocolError(f"message header of {len(data)} bytes; at most {MAX_HEADER_BYTES} are allowed")
+def _unpack(data: bytes) -> tuple[object, int]:
+    """Return a message as plain values, and its minor version."""
     try:
         value = msgpack.unpackb(data, raw=False, strict_map_key=True, max_ext_len=0)
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as e:
@@ -264,4 +388,14 @@ def _decode(data: bytes, kind: type[_Body_T]) -> _Body_T:
         raise VersionError(
             f"protocol version {value['protocol']}; this bricktrack speaks version {PROTOCOL_VERSION}"
         )
-    return convert(value, kind, where="message", error=ProtocolError)
+    minor = value.get("minor")
+    return value, minor if isinstance(minor, int) else 0
+
+
+def _explained(error: ProtocolError, minor: int) -> ProtocolError:
+    if minor <= PROTOCOL_MINOR:
+        return error
+    return ProtocolError(
+        f"{error}. The message is of protocol {PROTOCOL_VERSION}.{minor}, this bricktrack speaks "
+        f"{PROTOCOL_VERSION}.{PROTOCOL_MINOR}: upgrade it"
+    )

@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self, TypeVar
@@ -20,11 +20,17 @@ from bricktrack_common.checksums import crc32
 from bricktrack_common.errors import ProtocolError, TransferError, UnitError, UnitTimeoutError
 from bricktrack_common.wire_messages import (
     MAX_CHUNK_BYTES,
+    MAX_STILL_BYTES,
     Arm,
     Armed,
     Chunk,
+    Configure,
+    Configured,
+    ConfigValue,
     Confirm,
     Confirmed,
+    Deleted,
+    DeleteRun,
     DescribeRun,
     Disarm,
     Disarmed,
@@ -39,6 +45,9 @@ from bricktrack_common.wire_messages import (
     RunDescription,
     RunList,
     StatusReply,
+    StillEncoding,
+    StillImage,
+    TakeStill,
     VersionError,
     decode_reply,
     encode_message,
@@ -170,6 +179,44 @@ class UnitClient:
         """Tell the unit that these files, in the order of its description, are verified and on disk here."""
         return self._ask(Confirm(run_id=run_id, sha256=sha256), Confirmed)
 
+    def delete_run(self, run_id: str, *, force: bool = False, timeout_s: float = 30.0) -> Deleted:
+        """Remove a run from the unit: one that a host has confirmed, or any with ``force``."""
+        return self._ask(DeleteRun(run_id=run_id, force=force), Deleted, timeout_s=timeout_s)
+
+    def configure(
+        self, values: Mapping[str, ConfigValue] | None = None, *, timeout_s: float = 30.0
+    ) -> Configured:
+        """Change values of the unit's configuration, for good; without any, only ask what they are.
+
+        Parameters
+        ----------
+        values : mapping
+            By dotted key, ``{"camera.exposure_us": 2000}``; `None` goes back to what the unit's file says.
+        """
+        return self._ask(Configure(values=dict(values or {})), Configured, timeout_s=timeout_s)
+
+    def still(
+        self, *, encoding: StillEncoding = "png", lit: bool = True, timeout_s: float = 45.0
+    ) -> tuple[StillImage, bytes]:
+        """Return a picture of now: what is said of it, and the bytes of a PNG or JPEG file.
+
+        The unit must be idle; starting its camera takes seconds. A PNG is grey: the camera's own luma, 16
+        for black and 235 for white. With ``lit`` the LEDs are lit, where they hang on the unit's pins.
+
+        Raises
+        ------
+        TransferError
+            If the picture does not match its checksum.
+        """
+        reply, data = self._ask_with_data(
+            TakeStill(encoding=encoding, lit=lit), StillImage, timeout_s=timeout_s
+        )
+        if len(data) != reply.n_bytes or crc32(data) != reply.crc32:
+            raise TransferError(
+                f"{self.address}: the picture came broken ({len(data)} of {reply.n_bytes} bytes); ask again"
+            )
+        return reply, data
+
     def read_chunks(
         self, run_id: str, file_index: int, ranges: list[tuple[int, int]], *, credit: int = CREDIT
     ) -> Iterator[tuple[int, bytes]]:
@@ -229,13 +276,18 @@ class UnitClient:
         waiting.appendleft(chunk)
 
     def _ask(self, request: Request, kind: type[_Reply_T], *, timeout_s: float | None = None) -> _Reply_T:
+        return self._ask_with_data(request, kind, timeout_s=timeout_s)[0]
+
+    def _ask_with_data(
+        self, request: Request, kind: type[_Reply_T], *, timeout_s: float | None = None
+    ) -> tuple[_Reply_T, bytes]:
         deadline_s = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
         asked_for = str(type(request).__struct_config__.tag)
         request_id = self._send(request, min(deadline_s, time.monotonic() + self.timeout_s))
         while True:
-            reply_id, reply, _ = self._receive(deadline_s, asked_for)
+            reply_id, reply, data = self._receive(deadline_s, asked_for)
             if reply_id == request_id:
-                return self._expect(reply, kind, asked_for)
+                return self._expect(reply, kind, asked_for), data
             self.counts.stray_replies += 1
 
     def _expect(self, reply: Reply, kind: type[_Reply_T], asked_for: str) -> _Reply_T:
@@ -264,10 +316,10 @@ class UnitClient:
                 logger.debug("%s: foreign message: %s", self.address, e)
                 self.counts.foreign_messages += 1
                 continue
-            if len(rest) != (1 if isinstance(reply, Chunk) else 0):
+            if len(rest) not in _frames_allowed(reply):
                 self.counts.foreign_messages += 1
                 continue
-            return request_id, reply, rest[0] if rest else b""
+            return request_id, reply, rest[0] if len(rest) == 1 else b"".join(rest)
 
     def _wait_for(self, event: int, deadline_s: float, problem: str) -> None:
         while True:
@@ -282,6 +334,17 @@ class UnitClient:
                     f"{self.address}: {problem} in time. Is the unit on, bricktrackd running and the address "
                     "right?" + (f" {foreign} messages came that are not bricktrack's" if foreign else "")
                 )
+
+
+def _frames_allowed(reply: Reply) -> range:
+    """Return how many raw frames may follow a reply."""
+    match reply:
+        case Chunk():
+            return range(1, 2)
+        case StillImage():
+            return range(1, MAX_STILL_BYTES // MAX_CHUNK_BYTES + 1)
+        case _:
+            return range(1)
 
 
 def _chunk_problem(reply: Chunk, data: bytes, run_id: str, file_index: int, chunk: _Asked) -> str:

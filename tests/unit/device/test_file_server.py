@@ -130,12 +130,12 @@ def test_refusals_and_bugs_become_refusals_with_codes(host: Host, caplog: pytest
 @pytest.mark.parametrize(
     ("message", "code", "request_id"),
     [
-        ({"protocol": 2, "request_id": 5, "body": {"type": "hello", "software": "x"}}, "bad-version", 5),
-        ({"protocol": 1, "request_id": 6, "body": {"type": "shutdown"}}, "bad-message", 6),
-        ({"protocol": 1, "request_id": 7, "body": {"type": "hello", "software": "x", "more": 1}}, "bad-message", 7),
-        ({"protocol": 1, "request_id": 8, "body": {"type": "describe", "run_id": "../etc/passwd"}}, "bad-message", 8),
-        ({"protocol": 1, "request_id": -1, "body": {"type": "hello", "software": "x"}}, "bad-message", 0),
-        ({"protocol": 1, "request_id": 9,
+        ({"protocol": 1, "request_id": 5, "body": {"type": "hello", "software": "x"}}, "bad-version", 5),
+        ({"protocol": 2, "minor": 0, "request_id": 6, "body": {"type": "shutdown"}}, "bad-message", 6),
+        ({"protocol": 2, "minor": 0, "request_id": 7, "body": {"type": "hello", "software": "x", "more": 1}}, "bad-message", 7),
+        ({"protocol": 2, "minor": 0, "request_id": 8, "body": {"type": "describe", "run_id": "../etc/passwd"}}, "bad-message", 8),
+        ({"protocol": 2, "minor": 0, "request_id": -1, "body": {"type": "hello", "software": "x"}}, "bad-message", 0),
+        ({"protocol": 2, "minor": 0, "request_id": 9,
           "body": {"type": "read", "run_id": "r", "file_index": 0, "offset": 0, "length": 1 << 30}},
          "bad-message", 9),
         ([1, 2, 3], "bad-message", 0),

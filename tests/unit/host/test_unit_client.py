@@ -96,7 +96,7 @@ def test_duplicated_and_late_replies_are_counted_and_ignored(runs):
 
 
 def test_foreign_bytes_are_counted_and_ignored(runs):
-    junk = [[b"GET / HTTP/1.1\r\n"], [b""], [msgpack.packb({"protocol": 1})], [b"\xc1", b"x"]]
+    junk = [[b"GET / HTTP/1.1\r\n"], [b""], [msgpack.packb({"protocol": 2})], [b"\xc1", b"x"]]
     with (
         FakeUnit(runs, misbehave=lambda request, messages: [*junk, *messages]) as unit,
         UnitClient(unit.address) as client,
@@ -124,7 +124,7 @@ def test_a_silent_address_times_out_with_words():
 
 def test_another_protocol_version_is_named(runs):
     def newer(request, messages):
-        envelope = msgpack.unpackb(messages[0][0]) | {"protocol": 2}
+        envelope = msgpack.unpackb(messages[0][0]) | {"protocol": 9}
         return [[msgpack.packb(envelope)]]
 
     with (
