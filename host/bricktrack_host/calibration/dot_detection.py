@@ -24,7 +24,7 @@ from bricktrack_host.calibration.dot_regions import (
     Regions,
     round_regions,
 )
-from bricktrack_host.calibration.dot_sizes import LARGE_AREA_RATIO, area_ratios
+from bricktrack_host.calibration.dot_sizes import LARGE_AREA_RATIO, area_ratios, have_odd_shapes
 from bricktrack_host.calibration.neighbours import Neighbours, median_spacing
 
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
@@ -210,8 +210,11 @@ def _measure(light: Light, regions: Regions, polarity: Polarity) -> Dots:
         ratio = area_ratios(uv[whole], area[whole])
         # Shapes of the small dots: what a large one would be at its place.
         shrink = np.where(ratio > np.sqrt(LARGE_AREA_RATIO), LARGE_AREA_RATIO, 1.0)
-        spread = np.array([moments[k].spread_px2 for k in whole]) - blur**2 * np.eye(2)
-        shape = 4 * spread / shrink[:, None, None]
+        spread = np.array([moments[k].spread_px2 for k in whole])
+        odd = have_odd_shapes(uv[whole], spread / shrink[:, None, None])
+        good[whole[odd]] = False
+        whole, shrink, spread = whole[~odd], shrink[~odd], spread[~odd]
+        shape = 4 * (spread - blur**2 * np.eye(2)) / shrink[:, None, None]
         sizes = (1.0, LARGE_AREA_RATIO) if np.any(shrink > 1) else (1.0,)
         near = Neighbours(middle[whole]).nearest(middle, 3)[1]
         for i in np.flatnonzero(good & touches):

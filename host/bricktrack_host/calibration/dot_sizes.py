@@ -1,4 +1,4 @@
-"""Small dots and large ones: each dot's area beside that of the small dots around it.
+"""Small dots, large ones, and odd ones: each dot's area and shape beside those of the dots around it.
 
 Distance, slant and distortion change the dots' areas smoothly over a picture, so only dots of one
 neighbourhood are compared.
@@ -6,13 +6,16 @@ neighbourhood are compared.
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.calibration.neighbours import Neighbours
 from bricktrack_host.calibration.printed_target import LARGE_RATIO
 
 LARGE_AREA_RATIO = LARGE_RATIO**2
 MAX_ODD = 0.35
 """Share of the way from small to large by which a dot may miss its class."""
+MIN_ODD_SHAPE = 0.06
+"""No dot is odd whose second moments differ by less than this share from its neighbours'."""
+ODD_SIGMAS = 8.0
 
 _N_AROUND = 24
 _SMALL_PERCENTILE = 30.0  # a quarter are large: of 24 dots more than 16 are so once in 5 million
@@ -72,3 +75,23 @@ def size_classes(ratio: FloatArray) -> IntArray:
     share = np.log(ratio) / np.log(LARGE_AREA_RATIO)
     nearest = np.clip(np.rint(share), 0, 1)
     return np.where(np.abs(share - nearest) < MAX_ODD, nearest, -1).astype(np.int64)
+
+
+def have_odd_shapes(uv_px: FloatArray, shape_px2: FloatArray) -> BoolArray:
+    """Tell which dots have another shape than their neighbours: glare, dirt, or not dots at all.
+
+    Parameters
+    ----------
+    uv_px : ndarray, shape (n, 2), px
+    shape_px2 : ndarray, shape (n, 2, 2), px^2
+        Second moments of the dots' light, those of large dots divided by `LARGE_AREA_RATIO`.
+    """
+    n = len(uv_px)
+    k = min(_N_AROUND // 2 + 1, n)
+    if k < 6:
+        return np.zeros(n, dtype=np.bool_)
+    near = Neighbours(uv_px).nearest(uv_px, k)[1][:, 1:]
+    usual = np.median(shape_px2[near], axis=1)
+    size = np.trace(usual, axis1=1, axis2=2)
+    differing = np.sqrt(2 * np.sum((shape_px2 - usual) ** 2, axis=(1, 2))) / size
+    return np.asarray(differing > np.maximum(MIN_ODD_SHAPE, ODD_SIGMAS * np.median(differing)))
