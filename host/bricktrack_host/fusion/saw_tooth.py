@@ -15,7 +15,7 @@ from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since, usable_samples
 from bricktrack_host.fusion.running_median import running_median
-from bricktrack_host.fusion.saw_tooth_kernel import optics_cost, slip_cost
+from bricktrack_host.fusion.saw_tooth_kernel import likeliest_path, optics_cost, slip_cost
 from bricktrack_host.tracks import ImuTrack
 
 MIN_PAIRS = 60  # of frames side by side, for a search
@@ -320,19 +320,7 @@ class SawToothSearch:
         price[~(self._fresh | self._is_repeat)] = 0.0
         unseen = np.full(len(number), _UNSEEN_SKIP)
         unseen[self._fresh] += self._kink_gain
-        total, came = price[0], np.zeros((len(number), 3), dtype=np.int64)
-        for j in range(1, len(number)):
-            step = number[j] - number[j - 1][:, None]  # from, to
-            allowed = step == 0 if self._is_repeat[j] else step >= 1
-            way_cost = total[:, None] + np.where(allowed, 0.0, _FORBIDDEN)
-            if self._slot[j] - self._slot[j - 1] == 1:
-                way_cost = way_cost + np.where(step > 1, unseen[j - 1], 0.0)
-            came[j] = np.argmin(way_cost, axis=0)
-            total = way_cost.min(axis=0) + price[j]
-        path = np.empty(len(number), dtype=np.int64)
-        path[-1] = int(np.argmin(total))
-        for j in range(len(number) - 1, 0, -1):
-            path[j - 1] = came[j, path[j]]
+        path = likeliest_path(number, price, self._is_repeat, np.diff(self._slot) == 1, unseen, _FORBIDDEN)
         return np.asarray(np.maximum.accumulate(number[np.arange(len(number)), path]))
 
 

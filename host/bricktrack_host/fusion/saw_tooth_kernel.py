@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.compiled import compiled
 
 
@@ -90,3 +90,50 @@ def slip_cost(
                     kinks[p] += (best + 1) * weight
             weight = weight * 7919 if i % 4 != 3 else 1
     return cost, kinks
+
+
+@compiled
+def likeliest_path(
+    number: IntArray,
+    price: FloatArray,
+    is_repeat: BoolArray,
+    is_next_slot: BoolArray,
+    unseen: FloatArray,
+    forbidden: float,
+) -> IntArray:
+    """Return which of the candidates of each read makes the cheapest sequence (Viterbi), shape (n,).
+
+    Parameters
+    ----------
+    number : ndarray of int64, shape (n, c)
+        Samples that each read may have found.
+    price : ndarray, shape (n, c)
+    is_repeat : ndarray of bool, shape (n,)
+        The read found the sample before once more; others find a later one. Else ``forbidden`` is paid.
+    is_next_slot : ndarray of bool, shape (n - 1,)
+        Whether the next read was made one slot later.
+    unseen : ndarray, shape (n,)
+        Price of a sample left out after each read, where that is so.
+    """
+    n, n_choices = number.shape
+    total, there = price[0].copy(), np.empty(n_choices)
+    came = np.zeros((n, n_choices), dtype=np.int64)
+    for j in range(1, n):
+        for to in range(n_choices):
+            least = np.inf
+            for start in range(n_choices):
+                step = number[j, to] - number[j - 1, start]
+                cost = total[start]
+                if (step != 0) if is_repeat[j] else (step < 1):
+                    cost += forbidden
+                if step > 1 and is_next_slot[j - 1]:
+                    cost += unseen[j - 1]
+                if cost < least:
+                    least, came[j, to] = cost, start
+            there[to] = least + price[j, to]
+        total[:] = there
+    path = np.empty(n, dtype=np.int64)
+    path[n - 1] = np.argmin(total)
+    for j in range(n - 1, 0, -1):
+        path[j - 1] = came[j, path[j]]
+    return path

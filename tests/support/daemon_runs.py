@@ -1,0 +1,208 @@
+"""Runs as a simulated unit records them, without video and without waiting: chip registers and LED centroids.
+
+The inertial samples come from the simulated chip, read burst by burst on a punctual grid that beats with the
+chip's own clock, and are decoded as a run's are. The LEDs are seen by a pinhole camera with distortion, each
+at its own row's mid-exposure, with white noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pinhole import PinholeCamera
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.brick_model import BrickModel, ProfileEntry
+from bricktrack_common.imu_records import (
+    FIRST_REGISTER,
+    N_DATA_BYTES,
+    STANDARD_GRAVITY_MPS2,
+    ImuDescription,
+    ImuRecord,
+    decode_imu,
+)
+from bricktrack_device.sim.bno055_chip import Bno055Chip
+from bricktrack_device.sim.imu_signal import ImuSensors, chip_period_s
+from bricktrack_device.sim.settings import HiddenLed, SimImu, SimSettings
+from bricktrack_device.sim.world import SimWorld
+from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracks import ImuTrack, LedObservations
+
+EPOCH_NS = 50_000_000_000
+_COLLAR_MM = 0.7
+_FRAME_PERIOD_NS = 33_326_890
+_EXPOSURE_NS = 2_000_000
+_PERIOD_NS = 10_000_000
+_ACC_CONFIG_16G_62HZ, _AMG = 0x0F, 0x07
+
+
+class _FixedEpoch:
+    """The first edge where no process needs to be told of it."""
+
+    value = EPOCH_NS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DaemonRun:
+    """What a unit recorded, and the world that it was recorded in."""
+
+    observations: LedObservations
+    imu: ImuTrack
+    camera: PinholeCamera
+    brick: BrickModel
+    world: SimWorld
+    stamp_offset_ns: int
+
+    def truth(self, t_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return true rotations and positions, mm, at camera times."""
+        return self.world.pose(t_ns)
+
+    @property
+    def lever_arm_mm(self) -> FloatArray:
+        """From the origin LED to the IMU, brick axes."""
+        if self.brick.imu_lever_arm_mm is None:
+            raise ValueError("the simulated brick has no IMU")
+        return self.brick.imu_lever_arm_mm
+
+    def hidden(self, t_ns: IntArray) -> FloatArray:
+        """Return whether instants lie in a dropout."""
+        since = self.world.since_first_edge_s(t_ns)
+        return np.any([(since > a) & (since < a + d) for a, d in self.world.settings.dropouts], axis=0)
+
+
+def simulate_run(
+    seed: int,
+    *,
+    motion: str = "impacts",
+    amplitude_mm: float = 3.0,
+    amplitude_deg: float = 2.0,
+    impact_mps: float = 0.1,
+    dropouts: tuple[tuple[float, float], ...] = (),
+    hidden_leds: tuple[tuple[str, float, float], ...] = (),
+    duration_s: float = 15.0,
+    stamp_offset_ns: int = 0,
+    centroid_sd_px: float = 0.05,
+    clock_ppm: float | None = None,
+    acc_range_g: int = 16,
+    outlier_share: float = 0.0,
+) -> DaemonRun:
+    """Return one run: a second of rest, a shake, a second of rest.
+
+    Parameters
+    ----------
+    hidden_leds : tuple of (name, start_s, duration_s)
+    stamp_offset_ns : int, ns
+        Added to the inertial stamps: what the alignment has to find, beside the sensors' lags.
+    clock_ppm : float, optional
+        By how much the chip's clock is slow; else the seed says.
+    outlier_share : float
+        Of LED centroids that are up to 8 px off.
+    """
+    settings = SimSettings(
+        seed=seed,
+        motion=motion,
+        amplitude_mm=amplitude_mm,
+        amplitude_deg=amplitude_deg,
+        impact_mps=impact_mps,
+        quiet_s=1.0,
+        shake_s=duration_s - 2.0,
+        dropouts=list(dropouts),
+        hidden_leds=[HiddenLed(name=n, start_s=a, duration_s=d) for n, a, d in hidden_leds],
+        imu=SimImu(clock_ppm=clock_ppm),
+    )
+    world = SimWorld(settings, _FixedEpoch())
+    rng = np.random.default_rng([seed, 77])
+    camera = PinholeCamera()
+    brick = world.brick
+    brick = BrickModel(
+        name=brick.name,
+        led_names=brick.led_names,
+        led_positions_mm=brick.led_positions_mm,
+        led_axes=brick.led_axes,
+        led_radii_mm=brick.led_radii_mm,
+        imu_lever_arm_mm=brick.imu_lever_arm_mm,
+        R_brick_imu=brick.R_brick_imu,
+        led_profile=ProfileEntry(collar_mm=_COLLAR_MM, source="simulated"),
+    )
+    observations = _observe(world, camera, brick, rng, duration_s, centroid_sd_px, outlier_share)
+    imu = _sample(world, rng, duration_s, stamp_offset_ns, acc_range_g)
+    return DaemonRun(observations, imu, camera, brick, world, stamp_offset_ns)
+
+
+def _observe(
+    world: SimWorld,
+    camera: PinholeCamera,
+    brick: BrickModel,
+    rng: np.random.Generator,
+    duration_s: float,
+    sd_px: float,
+    outlier_share: float,
+) -> LedObservations:
+    n = int(duration_s * 1e9 / _FRAME_PERIOD_NS)
+    stamp = (
+        EPOCH_NS + round(rng.uniform(0, _FRAME_PERIOD_NS)) + np.arange(n, dtype=np.int64) * _FRAME_PERIOD_NS
+    )
+    mode = camera.sensor_mode
+    v = np.full((n, brick.n_leds), 0.5 * mode.height)
+    for _ in range(4):  # the row decides the instant, and the instant the row
+        t_ns = stamp[:, None] - _EXPOSURE_NS // 2 + np.rint(mode.row_delay_ns(v)).astype(np.int64)
+        R, t_mm = world.pose(t_ns.ravel())
+        pose = R.reshape(n, -1, 3, 3), t_mm.reshape(n, -1, 3)
+        prediction, _ = predict_brick(*pose, camera, brick, collar_mm=_COLLAR_MM)
+        v = prediction.uv_px[..., 1]
+    uv = prediction.uv_px + rng.normal(0, sd_px, prediction.uv_px.shape)
+    far = rng.random(uv.shape[:2]) < outlier_share
+    uv[far] += rng.uniform(-8, 8, (int(far.sum()), 2))
+    gone = world.leds_hidden(t_ns[:, 0]) | (world.card_cover(t_ns[:, 0]) > 0)[:, None]
+    uv[gone] = np.nan
+    return LedObservations(
+        sensor_timestamp_ns=stamp,
+        exposure_ns=np.full(n, _EXPOSURE_NS, dtype=np.int64),
+        uv_px=uv,
+        cov_px2=np.broadcast_to(sd_px**2 * np.eye(2), (*uv.shape, 2)).copy(),
+        area_px2=prediction.area_px2,
+        led_flags=np.zeros(uv.shape[:2], dtype=np.int64),
+        frame_flags=np.zeros(n, dtype=np.int64),
+    )
+
+
+def _sample(
+    world: SimWorld, rng: np.random.Generator, duration_s: float, stamp_offset_ns: int, acc_range_g: int
+) -> ImuTrack:
+    sensors = ImuSensors(world, on_camera=False, stream=1)
+    chip = Bno055Chip(bytes(16), sensors.measure, period_s=chip_period_s(world.settings, 1))
+    on_ns = EPOCH_NS - 2_000_000_000
+    range_code = {2: 0, 4: 1, 8: 2, 16: 3}[acc_range_g]
+    for register, value in (
+        (0x07, 1),
+        (0x08, _ACC_CONFIG_16G_62HZ & ~3 | range_code),
+        (0x07, 0),
+        (0x3D, _AMG),
+    ):
+        chip.write(register, bytes([value]), on_ns)
+    t0_ns = EPOCH_NS - 400_000_000 + round(rng.uniform(0, _PERIOD_NS))
+    description = ImuDescription(
+        name="brick",
+        chip_id="",
+        bus="sim",
+        address=0x28,
+        opr_mode=_AMG,
+        fusion=False,
+        acc_range_g=float(acc_range_g),
+        period_ns=_PERIOD_NS,
+        t0_ns=t0_ns,
+    )
+    records = []
+    for slot in range(int((duration_s + 0.8) * 100)):
+        # A wake-up is late by some 30 us, now and then by more; a burst takes 1.3 ms, give or take.
+        before = t0_ns + slot * _PERIOD_NS + round(abs(rng.normal(0, 3e4)) + (rng.random() < 0.01) * 4e5)
+        after = before + round(1.3e6 + abs(rng.normal(0, 2e4)))
+        data = chip.read(FIRST_REGISTER, N_DATA_BYTES, (before + after) // 2)
+        records.append(ImuRecord(slot, before, after, data, 0, None))
+    samples = decode_imu(description, records)
+    return ImuTrack(
+        t_ns=samples.t_ns + stamp_offset_ns,
+        acc_mps2=samples.acc_mps2,
+        gyro_radps=samples.gyro_radps,
+        flags=samples.flags,
+        acc_range_mps2=acc_range_g * STANDARD_GRAVITY_MPS2,
+    )
