@@ -28,14 +28,14 @@ class BoardPose:
     tilt_y_deg: float = 0.0
 
     @property
-    def R(self):
+    def rotation(self):
         return Rotation.from_euler(
             "ZYX", [self.turn_deg, self.tilt_y_deg, self.tilt_x_deg], degrees=True
         ).as_matrix()
 
     def points(self, xy_mm):
         xyz = np.concatenate([xy_mm, np.zeros((*xy_mm.shape[:-1], 1))], axis=-1)
-        return xyz @ self.R.T + np.array(self.at_mm)
+        return xyz @ self.rotation.T + np.array(self.at_mm)
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def _slope_splines(camera, width, height):
 
 def _printed_at(target, diameters, pose, x, y):
     """Return, for rays of slopes x, y, whether they meet a dot, and whether they miss the sheet."""
-    R, t = pose.R, np.array(pose.at_mm)
+    R, t = pose.rotation, np.array(pose.at_mm)
     normal = R[:, 2]
     depth = (normal @ t) / (normal[0] * x + normal[1] * y + normal[2])
     dx, dy, dz = depth * x - t[0], depth * y - t[1], depth - t[2]
