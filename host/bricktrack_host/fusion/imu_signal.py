@@ -16,6 +16,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_a
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag
 from bricktrack_common.rotations import matrix_from_rvec
+from bricktrack_host.compiled import compiled
 from bricktrack_host.fusion.running_median import running_median
 from bricktrack_host.tracks import ImuTrack
 
@@ -355,11 +356,17 @@ class ImuSignal:
         return Increments(R=R, dv_mps=dv, dp_m=dp, R_half=R_half, f_rate_mps3=rate, f_curve_mps4=curve)
 
 
+@compiled
 def chain_rotations(steps: FloatArray) -> FloatArray:
-    """Return the running products ``steps[0] @ ... @ steps[i]``, shape (n, 3, 3), in log2(n) passes."""
-    R = np.array(steps)
-    shift = 1
-    while shift < len(R):
-        R[shift:] = R[:-shift] @ R[shift:]
-        shift *= 2
-    return R
+    """Return the running products ``steps[0] @ ... @ steps[i]``, shape (n, 3, 3)."""
+    out = np.empty_like(steps)
+    if len(steps):
+        out[0] = steps[0]
+    for k in range(1, len(steps)):
+        before, step = out[k - 1], steps[k]
+        for i in range(3):
+            for j in range(3):
+                out[k, i, j] = (
+                    before[i, 0] * step[0, j] + before[i, 1] * step[1, j] + before[i, 2] * step[2, j]
+                )
+    return out
