@@ -27,7 +27,8 @@ from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _MIN_POSITION_SD_M = 2e-6  # a covariance below this is not believed
 _ONE_MISSING = 2.5  # periods between samples above which more than one is missing
-_SAME_NODE_S = 2e-4  # grid nodes this near to a frame are left out
+_LONGEST_STEP_PERIODS = 1.25
+_NOISE_POINTS = 4  # of a step, over which its noise is averaged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,20 +165,17 @@ def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
 
 
 def place_nodes(run: Run, lin: Linearisation) -> Nodes:
-    """Return a grid at the IMU's rate with the frames' instants let in, a step wider than what is wanted."""
+    """Return the frames' instants and even steps between them, to a step beyond what is wanted."""
     t_frame = run.imu_time_s(run.t_cam_s, lin)
     lo, hi = run.imu_time_s(np.array(run.span_cam_s), lin)
     step = run.signal.period_s
-    n = int(np.ceil((hi - lo) / step)) + 2
-    grid = np.linspace(lo - step, hi + step, n + 1)
-    i = np.clip(np.searchsorted(t_frame, grid), 1, len(t_frame) - 1) if len(t_frame) > 1 else None
-    near = (
-        np.minimum(np.abs(grid - t_frame[i]), np.abs(grid - t_frame[i - 1]))
-        if i is not None
-        else np.abs(grid - t_frame[0])
-    )
-    t_s = np.sort(np.concatenate([grid[near > _SAME_NODE_S], t_frame]))
-    return Nodes(t_s, np.searchsorted(t_s, t_frame).astype(np.int64))
+    ends = np.concatenate([[min(lo, t_frame[0]) - step], t_frame, [max(hi, t_frame[-1]) + step]])
+    n_steps = np.maximum(np.ceil(np.diff(ends) / (_LONGEST_STEP_PERIODS * step)), 1).astype(np.int64)
+    first = np.concatenate([[0], np.cumsum(n_steps)])
+    interval = np.repeat(np.arange(len(n_steps)), n_steps)
+    share = (np.arange(first[-1]) - first[interval]) / n_steps[interval]
+    t_s = np.append(ends[interval] + share * np.diff(ends)[interval], ends[-1])
+    return Nodes(t_s, first[1:-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,7 +226,7 @@ class NoiseLevel:
 def noise_parts(
     signal: ImuSignal, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
 ) -> NoiseParts:
-    """Return how far the inertial signal is to be trusted at instants of IMU time."""
+    """Return how far the inertial signal is to be trusted over the steps between instants of IMU time."""
     s, period, hold = settings, signal.period_s, settings.systematic_time_s
     gyro = signal.gyro_radps - lin.bg_radps
     turn = np.linalg.norm(np.gradient(gyro, signal.t_s, axis=0), axis=1)
@@ -237,11 +235,13 @@ def noise_parts(
     moving = np.linalg.norm(signal.acc_mps2 - np.median(signal.acc_mps2, axis=0), axis=1)
     arm_m = s.lever_arm_sd_mm * 1e-3
 
-    def at(values: FloatArray, shift_s: float) -> FloatArray:
-        return np.interp(t_s + shift_s, signal.t_s, values)
+    points = t_s[:-1] + np.diff(t_s) * ((np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS)[:, None]
 
-    gap = np.where(signal.in_gap(t_s, least_periods=_ONE_MISSING), hold, 0.0)
-    bridged = np.where(signal.in_gap(t_s), period, 0.0)
+    def at(values: FloatArray, shift_s: float) -> FloatArray:
+        return np.asarray(np.interp(points + shift_s, signal.t_s, values).mean(axis=0))
+
+    gap = hold * signal.in_gap(points, least_periods=_ONE_MISSING).mean(axis=0)
+    bridged = period * signal.in_gap(points).mean(axis=0)
     gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
     shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
     acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2
@@ -350,8 +350,7 @@ def build_problem(
         pr.R_step[:k, b], pr.R_half[:k, b] = step.R, step.R_half
         pr.dv_mps[:k, b], pr.dp_m[:k, b] = step.dv_mps, step.dp_m
         pr.f_rate_mps3[:k, b], pr.f_curve_mps4[:k, b] = step.f_rate_mps3, step.f_curve_mps4
-        middle = 0.5 * (node.t_s[1:] + node.t_s[:-1])
-        parts.append(noise_parts(run.signal, middle, lin, settings))
+        parts.append(noise_parts(run.signal, node.t_s, lin, settings))
         pr.gyro_var[:k, b], pr.acc_var[:k, b] = parts[b].gyro(levels[b][0]), parts[b].acc(levels[b][1])
         pr.omega_radps[: k + 1, b] = run.signal.gyro_at(node.t_s)
         at = node.node_of_frame
