@@ -4,6 +4,7 @@
 """
 
 import ipaddress
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -198,16 +199,33 @@ def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> D
         the message names the file and the key.
     """
     config = DeviceConfig() if path is None else load_toml(path, DeviceConfig)
-    where = "defaults" if path is None else str(path)
-    for key, value in (overrides or {}).items():
+    check_config(config, where="defaults" if path is None else str(path))
+    return with_values(config, overrides or {}, where="command line")
+
+
+def with_values(config: DeviceConfig, values: Mapping[str, object], *, where: str) -> DeviceConfig:
+    """Return a configuration with some values replaced, checked as a whole.
+
+    Parameters
+    ----------
+    values : mapping
+        Values by dotted key; `None` values are left out.
+    where : str
+        Where they come from, to be named in the error.
+
+    Raises
+    ------
+    ConfigError
+        If a value is wrong, or does not go with the others.
+    """
+    for key, value in values.items():
         if value is not None:
-            config = _replaced(config, key, value)
-            where += f" with {key} = {value!r}"
+            config = _replaced(config, key, value, where=where)
     check_config(config, where=where)
     return config
 
 
-def _replaced(config: DeviceConfig, key: str, value: object) -> DeviceConfig:
+def _replaced(config: DeviceConfig, key: str, value: object, *, where: str) -> DeviceConfig:
     data = msgspec.to_builtins(config)
     table, _, name = key.rpartition(".")
     (data[table] if table else data)[name] = value
@@ -215,7 +233,7 @@ def _replaced(config: DeviceConfig, key: str, value: object) -> DeviceConfig:
         return msgspec.convert(data, DeviceConfig, strict=True)
     except msgspec.ValidationError as e:
         problem = str(e).partition(" - at `")[0]
-        raise ConfigError(f"command line: {key}: {problem}; got {value!r}") from e
+        raise ConfigError(f"{where}: {key}: {problem}; got {value!r}") from e
 
 
 def check_config(config: DeviceConfig, *, where: str) -> None:

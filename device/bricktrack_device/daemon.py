@@ -3,126 +3,24 @@
 import logging
 import signal
 import threading
-from importlib import metadata
 from pathlib import Path
 from types import FrameType
 
-from bricktrack_common.checksums import crc32
-from bricktrack_common.clocks import read_clock_triplet
-from bricktrack_common.errors import StorageError
-from bricktrack_common.wire_messages import (
-    Arm,
-    Chunk,
-    Confirm,
-    Confirmed,
-    DescribeRun,
-    Disarm,
-    GetStatus,
-    Hello,
-    HelloReply,
-    ListRuns,
-    Read,
-    Request,
-    RunList,
-    StatusReply,
-)
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.file_server import Answer, FileServer
-from bricktrack_device.health.machine import processor_temperature_degc
+from bricktrack_device.file_server import FileServer
 from bricktrack_device.health.watch import HealthWatch
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.recorder import Recorder
 from bricktrack_device.recovery import rebuild_manifest
-from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.remote_settings import RemoteSettings
 from bricktrack_device.run_store import RunStore
 from bricktrack_device.systemd_notify import notify
+from bricktrack_device.unit_service import UnitService
 from bricktrack_device.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
 
 WATCHDOG_PERIOD_S = 1.0
-
-
-class UnitService:
-    """Answers the host's requests from the recorder and the run store."""
-
-    def __init__(self, config: DeviceConfig, rig: Rig, recorder: Recorder, store: RunStore) -> None:
-        self._config = config
-        self._rig = rig
-        self.health = HealthWatch(config, rig)
-        self._recorder = recorder
-        self._store = store
-
-    def handle(self, request: Request, answer: Answer) -> None:
-        """Answer one request; see `bricktrack_device.file_server.RequestHandler`."""
-        match request:
-            case Hello():
-                answer(
-                    HelloReply(
-                        unit=self._config.unit.name,
-                        software=f"bricktrack {metadata.version('bricktrack')}",
-                        simulated=self._rig.simulated,
-                    ),
-                    None,
-                )
-            case GetStatus():
-                answer(self._status(), None)
-            case Arm():
-                self._recorder.arm(request.label, request.duration_s, lambda reply: answer(reply, None))
-            case Disarm():
-                self._recorder.disarm(lambda reply: answer(reply, None))
-            case ListRuns():
-                answer(RunList(runs=self._store.list_runs()), None)
-            case DescribeRun():
-                answer(self._store.describe(request.run_id), None)
-            case Read():
-                self._refuse_while("armed", "recording", "saving")
-                data = self._store.read_chunk(
-                    request.run_id, request.file_index, request.offset, request.length
-                )
-                chunk = Chunk(
-                    run_id=request.run_id,
-                    file_index=request.file_index,
-                    offset=request.offset,
-                    n_bytes=len(data),
-                    crc32=crc32(data),
-                )
-                answer(chunk, data)
-            case Confirm():
-                self._refuse_while("recording", "saving")
-                self._store.confirm(request.run_id, request.sha256)
-                answer(Confirmed(run_id=request.run_id), None)
-
-    def _refuse_while(self, *states: str) -> None:
-        state = self._recorder.state
-        if state in states:
-            raise RequestRefusedError("busy", f"the unit is {state}; it transfers nothing meanwhile")
-
-    def _status(self) -> StatusReply:
-        recorder = self._recorder.status()
-        try:
-            n_runs, free = self._store.count_runs(), self._store.free_bytes()
-        except (StorageError, OSError) as e:
-            raise RequestRefusedError("internal", f"storage: {e}") from e
-        return StatusReply(
-            unit=self._config.unit.name,
-            state=recorder.state,
-            reason=recorder.reason[:2000],
-            run_id=recorder.run_id,
-            runs=n_runs,
-            disk_free_bytes=free,
-            disk_needed_bytes=recorder.disk_needed_bytes,
-            frames=recorder.frames,
-            frame_age_ms=recorder.frame_age_ms,
-            imus=recorder.imus,
-            edges=recorder.edges,
-            line_is_high=recorder.line_is_high,
-            temperature_degc=processor_temperature_degc(),
-            last_error=recorder.last_error,
-            health=list(self.health.items),
-            health_age_s=self.health.age_s,
-            clocks=read_clock_triplet(),
-        )
 
 
 class Daemon:
@@ -156,8 +54,11 @@ class Daemon:
         store = RunStore(self._config.storage_folder, self._config.unit.name)
         try:
             store.lock()
-            recorder = Recorder(self._config, self._rig, store)
-            service = UnitService(self._config, self._rig, recorder, store)
+            settings = RemoteSettings(self._config, store.folder)
+            config = settings.load()
+            self._rig.configure(config)
+            recorder = Recorder(config, self._rig, store)
+            service = UnitService(settings, self._rig, recorder, store)
             server = FileServer(self._config.server.address, self._config.server.port, service)
             for run_id in store.recover(rebuild_manifest):
                 logger.warning("%s: recovered after a cut while it was being saved", run_id)

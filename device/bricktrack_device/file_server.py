@@ -18,6 +18,7 @@ import zmq
 
 from bricktrack_common.errors import DeviceError, ProtocolError
 from bricktrack_common.wire_messages import (
+    MAX_CHUNK_BYTES,
     MAX_HEADER_BYTES,
     ErrorCode,
     Refusal,
@@ -198,7 +199,8 @@ class FileServer:
                 return
             frames = [identity, encode_message(request_id, reply)]
             if data is not None:
-                frames.append(data)
+                pieces = range(0, max(len(data), 1), MAX_CHUNK_BYTES)
+                frames += [data[start : start + MAX_CHUNK_BYTES] for start in pieces]
             try:
                 self._socket.send_multipart(frames, zmq.NOBLOCK)
             except zmq.ZMQError as e:

@@ -4,13 +4,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import gpiozero
 import numpy as np
 from numpy.typing import NDArray
 
 from bricktrack_common.run_manifest import CameraSection
+
+if TYPE_CHECKING:
+    from bricktrack_device.config import DeviceConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +161,10 @@ class Rig(Protocol):
     """All the hardware of a unit, real or simulated; made by `backends.open_rig` alone."""
 
     simulated: bool
+
+    def configure(self, config: "DeviceConfig") -> None:
+        """Use another configuration from the next opening of a part on."""
+        ...
 
     def open_camera(self) -> Camera:
         """Return the camera, not yet started."""

@@ -56,6 +56,13 @@ class _Disarm:
 
 
 @dataclass(frozen=True, slots=True)
+class _Do:
+    doing: str
+    work: Callable[[], None]
+    answer: Answer
+
+
+@dataclass(frozen=True, slots=True)
 class _Wake:
     pass
 
@@ -80,6 +87,7 @@ class RecorderStatus:
     line_is_high: bool | None
     last_error: str
     disk_needed_bytes: int
+    auto_arm: bool
 
 
 class _StoppingError(BricktrackError):
@@ -101,7 +109,7 @@ class Recorder:
         self._rig = rig
         self._store = store
         self._machine = StateMachine()
-        self._inbox: queue.SimpleQueue[_Arm | _Disarm | _Wake] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[_Arm | _Disarm | _Do | _Wake] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._stopping = threading.Event()
         self._session: Session | None = None
@@ -135,6 +143,14 @@ class Recorder:
         """Ask to go back to idle, or to leave a fault; answered with `Disarmed` or a `Refusal`."""
         self._inbox.put(_Disarm(answer))
 
+    def do_when_idle(self, doing: str, work: Callable[[], None], answer: Answer) -> None:
+        """Ask to do other work with the unit's sensors, in this thread, while nothing is recorded.
+
+        ``work`` calls `beat` while it waits and answers by itself; ``answer`` gets the `Refusal` if the unit
+        is armed, records or saves, or the work raises. ``doing`` says in the status what is going on.
+        """
+        self._inbox.put(_Do(doing, work, answer))
+
     @property
     def state(self) -> DaemonState:
         """The present state."""
@@ -161,6 +177,7 @@ class Recorder:
             line_is_high=trigger.line_is_high if trigger else None,
             last_error=self._last_error,
             disk_needed_bytes=disk_needed_bytes(self._config),
+            auto_arm=self._auto_arm,
         )
 
     @property
@@ -192,13 +209,13 @@ class Recorder:
                 self._save_what_there_is(f"internal error: {type(e).__name__}: {e}")
         self._end()
 
-    def _beat(self) -> None:
+    def beat(self) -> None:
         """Say that the thread is at work; give up waiting when the daemon is told to end."""
         self._last_beat = time.monotonic()
         if self._stopping.is_set():
             raise _StoppingError("the daemon is stopping")
 
-    def _obey(self, command: _Arm | _Disarm | _Wake) -> None:
+    def _obey(self, command: _Arm | _Disarm | _Do | _Wake) -> None:
         if isinstance(command, _Wake):
             return
         try:
@@ -206,9 +223,11 @@ class Recorder:
                 session = self._arm(command.label, command.duration_s)
                 self._auto_arm = self._config.recording.auto_arm
                 command.answer(Armed(run_id=session.run_id, missing=[m[:2000] for m in session.missing]))
-            else:
+            elif isinstance(command, _Disarm):
                 self._disarm()
                 command.answer(Disarmed())
+            else:
+                self._do(command)
         except RequestRefusedError as e:
             command.answer(Refusal(code=e.code, message=str(e)[:2000]))
         except StorageError as e:
@@ -264,7 +283,7 @@ class Recorder:
                 label=label,
                 duration_s=duration_s,
                 light=self._light,
-                beat=self._beat,
+                beat=self.beat,
             )
             self._session = session
             try:
@@ -293,6 +312,23 @@ class Recorder:
         self._must_allow("disarm")
         self._close_session()
         self._change("disarm")
+
+    def _do(self, command: _Do) -> None:
+        if self.state not in ("idle", "fault"):
+            raise RequestRefusedError(
+                "busy", f"the unit is {self.state}; {command.doing} waits until it is idle"
+            )
+        self._doing = command.doing
+        try:
+            command.work()
+        finally:
+            self._doing = ""
+
+    def configure(self, config: DeviceConfig) -> None:
+        """Work by another configuration from now on; to be called from `do_when_idle`."""
+        if config.recording.auto_arm != self._config.recording.auto_arm:
+            self._auto_arm = config.recording.auto_arm
+        self._config = config
 
     def _must_allow(self, cause: Cause) -> None:
         if self._machine.allows(cause):

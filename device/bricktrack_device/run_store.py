@@ -7,7 +7,9 @@
     <storage>/runs/<id>/           whole: its manifest was written last
     <storage>/confirmed/<id>.json  the host said that it holds these hashes
 
-Nothing is ever deleted here. A run exists when its manifest parses.
+    <storage>/deleted/<id>/        on its way out; emptied at the next start at the latest
+
+A run exists when its manifest parses. Nothing is deleted but by `RunStore.delete`.
 """
 
 import errno
@@ -15,10 +17,12 @@ import fcntl
 import logging
 import os
 import re
+import shutil
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import Literal, TextIO
 
 import msgspec
 
@@ -30,6 +34,7 @@ from bricktrack_common.run_manifest import (
     RunManifest,
     file_entry,
     is_run_id,
+    parse_manifest,
     read_manifest,
 )
 from bricktrack_common.typed_data import dump_json, load_json
@@ -42,6 +47,7 @@ logger = logging.getLogger(__name__)
 
 _COUNTER_IN_ID = re.compile(r"_[0-9a-f]{6}_(\d{4,})(?:_|$)")
 _MAX_LISTED = 10_000
+_MAX_OPEN = 8
 
 
 class _Counter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -51,6 +57,12 @@ class _Counter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class _Confirmation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     run_id: str
     sha256: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class _KnownRun:
+    state: Literal["complete", "interrupted"]
+    description: RunDescription
 
 
 class RunStore:
@@ -80,10 +92,12 @@ class RunStore:
         self._boot = (boot_id or _kernel_boot_id()).replace("-", "")[:6]
         self._lock = threading.Lock()
         self._lock_file: TextIO | None = None
-        self._manifests: dict[str, tuple[RunManifest, FileSummary]] = {}
+        self._runs_known: dict[str, _KnownRun] = {}
+        self._open_files: dict[tuple[str, str], int] = {}
         self._problems_told: set[str] = set()
         self.runs = folder / "runs"
         self._confirmed = folder / "confirmed"
+        self._deleted = folder / "deleted"
         try:
             for path in (self.runs, self._confirmed):
                 path.mkdir(parents=True, exist_ok=True)
@@ -115,7 +129,8 @@ class RunStore:
             ) from e
 
     def unlock(self) -> None:
-        """Let others have the folder."""
+        """Let others have the folder; also closes what reading left open."""
+        self.close_files()
         if self._lock_file is not None:
             self._lock_file.close()
             self._lock_file = None
@@ -168,6 +183,7 @@ class RunStore:
         recovered : list of str
             Run ids. What cannot be recovered stays where it is, with a warning.
         """
+        shutil.rmtree(self._deleted, ignore_errors=True)
         recovered = []
         for partial in sorted(self.runs.glob(f"*{PARTIAL_SUFFIX}")):
             run_id = partial.name.removesuffix(PARTIAL_SUFFIX)
@@ -203,19 +219,18 @@ class RunStore:
         summaries = []
         for folder in sorted(self._folders(), key=lambda p: (_counter_of(p.name), p.name))[-_MAX_LISTED:]:
             try:
-                manifest, of_manifest = self._manifest(folder.name)
+                run = self._known(folder.name)
             except RequestRefusedError as e:
                 if folder.name not in self._problems_told:
                     self._problems_told.add(folder.name)
                     logger.warning("%s", e)
                 continue
-            n_bytes = of_manifest.n_bytes + sum(f.n_bytes for f in manifest.files)
             summaries.append(
                 RunSummary(
                     run_id=folder.name,
-                    state=manifest.state,
-                    n_bytes=n_bytes,
-                    confirmed=(self._confirmed / f"{folder.name}.json").exists(),
+                    state=run.state,
+                    n_bytes=sum(f.n_bytes for f in run.description.files),
+                    confirmed=self.is_confirmed(folder.name),
                 )
             )
         return summaries
@@ -232,9 +247,7 @@ class RunStore:
         RequestRefusedError
             If there is no such run.
         """
-        manifest, of_manifest = self._manifest(run_id)
-        files = [FileSummary(name=f.name, n_bytes=f.n_bytes, sha256=f.sha256) for f in manifest.files]
-        return RunDescription(run_id=run_id, files=[of_manifest, *files])
+        return self._known(run_id).description
 
     def read_chunk(self, run_id: str, file_index: int, offset: int, length: int) -> bytes:
         """Return ``length`` bytes of a file from ``offset``, fewer at its end.
@@ -255,13 +268,28 @@ class RunStore:
                 "out-of-range", f"{run_id}: {entry.name} has {entry.n_bytes} bytes; offset {offset} is behind"
             )
         try:
-            with (self.runs / run_id / entry.name).open("rb") as file:
-                file.seek(offset)
-                return file.read(min(length, entry.n_bytes - offset))
+            # Not mapped into memory: a card that fails then is an error here, not the end of the process.
+            return os.pread(self._descriptor(run_id, entry.name), min(length, entry.n_bytes - offset), offset)
         except OSError as e:
             raise RequestRefusedError(
                 "internal", f"{run_id}: {entry.name} cannot be read: {e.strerror or e}"
             ) from e
+
+    def _descriptor(self, run_id: str, name: str) -> int:
+        """Return an open file's descriptor; the last few that were asked for stay open."""
+        key = run_id, name
+        found = self._open_files.pop(key, None)
+        if found is None:
+            found = os.open(self.runs / run_id / name, os.O_RDONLY)
+        self._open_files[key] = found
+        if len(self._open_files) > _MAX_OPEN:
+            os.close(self._open_files.pop(next(iter(self._open_files))))
+        return found
+
+    def close_files(self, run_id: str | None = None) -> None:
+        """Close the files that reading left open, of one run or all."""
+        for key in [k for k in self._open_files if run_id in (None, k[0])]:
+            os.close(self._open_files.pop(key))
 
     def confirm(self, run_id: str, sha256: list[str]) -> None:
         """Note that the host holds a run: the hashes, in any order, must be those of all its files.
@@ -289,16 +317,62 @@ class RunStore:
             code: ErrorCode = "no-space" if e.errno == errno.ENOSPC else "internal"
             raise RequestRefusedError(code, f"{path}: {e.strerror or e}") from e
 
+    def is_confirmed(self, run_id: str) -> bool:
+        """Tell whether a host has said that it holds a run."""
+        return (self._confirmed / f"{run_id}.json").exists()
+
+    def count_unconfirmed(self) -> int:
+        """Return how many run folders no host has confirmed."""
+        try:
+            notes = {p.stem for p in self._confirmed.glob("*.json")}
+        except OSError as e:
+            raise storage_error(f"{self._confirmed}: cannot be listed", e) from e
+        return sum(1 for folder in self._folders() if folder.name not in notes)
+
+    def delete(self, run_id: str, *, force: bool = False) -> int:
+        """Remove a run that a host has confirmed, or any with ``force``; return how many bytes it had.
+
+        The folder first leaves ``runs`` by one renaming: a power cut leaves a whole run, or none.
+
+        Raises
+        ------
+        RequestRefusedError
+            If there is no such run, it is not confirmed, or the card does not do it.
+        """
+        folder = self.runs / run_id
+        if not is_run_id(run_id) or run_id.endswith(PARTIAL_SUFFIX) or not folder.is_dir():
+            raise RequestRefusedError("no-such-run", f"there is no run {run_id!r:.120} on this unit")
+        if not force and not self.is_confirmed(run_id):
+            raise RequestRefusedError(
+                "not-confirmed",
+                f"no host has confirmed that it holds run {run_id}: pull it first, or force its deletion",
+            )
+        try:
+            self.close_files(run_id)
+            n_bytes = sum(p.stat().st_size for p in folder.iterdir())
+            self._deleted.mkdir(exist_ok=True)
+            shutil.rmtree(self._deleted / run_id, ignore_errors=True)
+            with self._lock:
+                self._runs_known.pop(run_id, None)
+                self._disk.rename(folder, self._deleted / run_id)
+            self._disk.sync_folder(self.runs)
+            (self._confirmed / f"{run_id}.json").unlink(missing_ok=True)
+            shutil.rmtree(self._deleted / run_id)
+        except OSError as e:
+            raise RequestRefusedError("internal", f"run {run_id} cannot be deleted: {e.strerror or e}") from e
+        logger.info("%s: deleted (%s)", run_id, "forced" if force else "confirmed")
+        return n_bytes
+
     def _folders(self) -> list[Path]:
         try:
             return [p for p in self.runs.iterdir() if is_run_id(p.name) and p.suffix != PARTIAL_SUFFIX]
         except OSError as e:
             raise storage_error(f"{self.runs}: cannot be listed", e) from e
 
-    def _manifest(self, run_id: str) -> tuple[RunManifest, FileSummary]:
-        """Return a run's manifest and the manifest file's own summary; both never change again."""
+    def _known(self, run_id: str) -> _KnownRun:
+        """Return what is said of a run; it never changes again."""
         with self._lock:
-            known = self._manifests.get(run_id)
+            known = self._runs_known.get(run_id)
             if known is not None:
                 return known
             if not is_run_id(run_id) or run_id.endswith(PARTIAL_SUFFIX):
@@ -307,13 +381,15 @@ class RunStore:
             if not path.parent.is_dir():
                 raise RequestRefusedError("no-such-run", f"there is no run {run_id} on this unit")
             try:
-                manifest = read_manifest(path)
                 data = path.read_bytes()
+                manifest = parse_manifest(data, where=str(path))
             except (RunFormatError, OSError) as e:
                 raise RequestRefusedError("no-such-run", f"run {run_id} cannot be read: {e}") from e
-            summary = FileSummary(name=MANIFEST_NAME, n_bytes=len(data), sha256=sha256_bytes(data))
-            self._manifests[run_id] = (manifest, summary)
-            return manifest, summary
+            files = [FileSummary(name=MANIFEST_NAME, n_bytes=len(data), sha256=sha256_bytes(data))]
+            files += [FileSummary(name=f.name, n_bytes=f.n_bytes, sha256=f.sha256) for f in manifest.files]
+            known = _KnownRun(manifest.state, RunDescription(run_id=run_id, files=files))
+            self._runs_known[run_id] = known
+            return known
 
 
 def _counter_of(name: str) -> int:

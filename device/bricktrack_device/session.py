@@ -4,7 +4,6 @@ One sensor failing stops no other: it is noted in words, and the run says what i
 """
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -15,6 +14,7 @@ from bricktrack_common.run_manifest import CameraSection, ClocksSection
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.edge_report import judge_edges
 from bricktrack_device.imu_reader import ImuReader
+from bricktrack_device.in_time import in_time
 from bricktrack_device.interfaces import Camera, Rig
 from bricktrack_device.recording import ImuRecording, Recording, RunLog
 from bricktrack_device.refusals import RequestRefusedError
@@ -365,27 +365,7 @@ class Session:
 
     def _in_time(self, what: str, call: Callable[[], T], timeout_s: float, *, give_up: bool = True) -> T:
         """Return what a camera's call returns; a call that hangs is left to its thread."""
-        results: list[T] = []
-        errors: list[BaseException] = []
-
-        def run() -> None:
-            try:
-                results.append(call())
-            except BaseException as e:  # noqa: BLE001 - raised again in the caller's thread
-                errors.append(e)
-
-        thread = threading.Thread(target=run, name=f"camera-{what}", daemon=True)
-        thread.start()
-        deadline = time.monotonic() + timeout_s
-        while thread.is_alive() and time.monotonic() < deadline:
-            if give_up:
-                self._beat()
-            thread.join(_POLL_S)
-        if errors:
-            raise errors[0]
-        if not results:
-            raise HardwareError(f"{what} hangs: no answer within {timeout_s:g} s. Restart bricktrackd")
-        return results[0]
+        return in_time(what, call, timeout_s, beat=self._beat if give_up else lambda: None)
 
     def _note_missing(self, words: str) -> None:
         logger.warning("%s: %s", self.run_id, words)

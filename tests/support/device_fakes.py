@@ -17,6 +17,7 @@ from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_manifest import CameraSection
+from bricktrack_device.config import DeviceConfig
 from bricktrack_device.hardware.led_bank import LedBank
 from bricktrack_device.interfaces import (
     BusOpener,
@@ -217,6 +218,9 @@ class FakeRig:
         self.armed_ns: list[int] = []
         self.truth_error: OSError | None = None
         self.closed = False
+
+    def configure(self, config: DeviceConfig) -> None:
+        self.config = config
 
     def open_camera(self) -> Camera:
         return self.camera

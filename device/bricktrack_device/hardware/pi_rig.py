@@ -46,6 +46,10 @@ class PiRig:
         self._factory: gpiozero.Factory | None = None
         self._buses: dict[str, str] = {}
 
+    def configure(self, config: DeviceConfig) -> None:
+        """Use another configuration from the next opening of a part on."""
+        self._config = config
+
     def open_camera(self) -> Camera:
         """Return the camera, not yet started."""
         return PiCamera(camera_settings(self._config.camera))

@@ -55,6 +55,10 @@ class HealthWatch:
         self._self_test = run_self_test(self._config, self._rig, is_over=is_over)
         _tell(self._self_test)
 
+    def configure(self, config: DeviceConfig) -> None:
+        """Look by another configuration from the next time on."""
+        self._config = config
+
     def refresh_if_due(self, state: DaemonState) -> bool:
         """Look again if it is time and the unit has nothing better to do; tell whether it did."""
         now = self._clock()

@@ -24,7 +24,7 @@ from bricktrack_device.sim.sim_pins import SquareWave, make_factory
 from bricktrack_device.sim.world import CARD_SLIDE_S, SimWorld, make_epoch
 
 if TYPE_CHECKING:
-    from bricktrack_device.config import CameraTable
+    from bricktrack_device.config import CameraTable, DeviceConfig
     from bricktrack_device.sim.settings import SimSettings
 
 _TRUTH_STEP_NS = 1_000_000
@@ -44,6 +44,10 @@ class SimRig:
         self._factory = make_factory()
         self._buses: list[str] = []
         self._wave = SquareWave(self.world, self._factory)
+
+    def configure(self, config: "DeviceConfig") -> None:
+        """Film by another configuration from the next camera on; the world stays as it is."""
+        self._camera = config.camera
 
     def open_camera(self) -> Camera:
         """Return the camera, not yet started."""

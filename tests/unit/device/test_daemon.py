@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zmq
 from device_fakes import FakeCamera, FakeRig
@@ -15,8 +16,12 @@ from bricktrack_common.wire_messages import (
     Arm,
     Armed,
     Chunk,
+    Configure,
+    Configured,
     Confirm,
     Confirmed,
+    Deleted,
+    DeleteRun,
     DescribeRun,
     Disarm,
     Disarmed,
@@ -31,11 +36,14 @@ from bricktrack_common.wire_messages import (
     RunDescription,
     RunList,
     StatusReply,
+    StillImage,
+    TakeStill,
     decode_reply,
     encode_message,
 )
 from bricktrack_device.config import DeviceConfig, RecordingTable, ServerTable, StorageTable, UnitTable
 from bricktrack_device.daemon import Daemon
+from bricktrack_device.interfaces import Still
 
 
 class Unit:
@@ -147,6 +155,95 @@ def test_disarm_answers_and_unknown_runs_are_refused(unit: Unit) -> None:
     for request in (DescribeRun(run_id="none"), Confirm(run_id="none", sha256=[])):
         reply, _ = unit.ask(request)
         assert isinstance(reply, Refusal) and reply.code == "no-such-run"
+
+
+def test_a_run_is_deleted_when_confirmed_or_by_force_and_never_meanwhile(unit: Unit, tmp_path: Path) -> None:
+    first, second = unit.record("a"), unit.record("b")
+    refused, _ = unit.ask(DeleteRun(run_id=first))
+    assert (
+        isinstance(refused, Refusal)
+        and refused.code == "not-confirmed"
+        and "pull it first" in refused.message
+    )
+    described, _ = unit.ask(DescribeRun(run_id=first))
+    assert isinstance(described, RunDescription)
+    assert unit.status().runs_unconfirmed == 2
+    unit.ask(Confirm(run_id=first, sha256=[f.sha256 for f in described.files]))
+    assert unit.status().runs_unconfirmed == 1
+
+    armed, _ = unit.ask(Arm())
+    assert isinstance(armed, Armed)
+    for run_id in (first, armed.run_id):
+        refused, _ = unit.ask(DeleteRun(run_id=run_id, force=True))
+        assert isinstance(refused, Refusal) and refused.code == "busy"
+    unit.ask(Disarm())
+
+    gone, _ = unit.ask(DeleteRun(run_id=first))
+    assert gone == Deleted(run_id=first, n_bytes=sum(f.n_bytes for f in described.files))
+    assert isinstance(unit.ask(DeleteRun(run_id=second, force=True))[0], Deleted)
+    listed, _ = unit.ask(ListRuns())
+    assert isinstance(listed, RunList) and listed.runs == []
+    assert unit.status().runs_unconfirmed == 0
+    again, _ = unit.ask(DeleteRun(run_id=first))
+    assert isinstance(again, Refusal) and again.code == "no-such-run"
+    assert unit.record("c").endswith(
+        "_0004_c"
+    )  # ids of deleted runs, and of the disarmed one, are not used again
+
+
+def test_a_still_is_taken_when_idle_and_refused_when_armed(unit: Unit) -> None:
+    luma = np.arange(64, dtype=np.uint8).reshape(8, 8)
+    chroma = np.full((4, 4), 128, np.uint8)
+    unit.rig.camera.picture = Still(luma, chroma, chroma)
+    image, data = unit.ask(TakeStill())
+    assert isinstance(image, StillImage) and data is not None
+    assert (image.n_bytes, image.crc32) == (len(data), crc32(data)) and data.startswith(b"\x89PNG")
+    assert (image.width_px, image.height_px, image.exposure_us, image.simulated) == (8, 8, 2000, True)
+    assert isinstance(unit.ask(Arm())[0], Armed)
+    refused, _ = unit.ask(TakeStill())
+    assert isinstance(refused, Refusal) and refused.code == "busy" and "armed" in refused.message
+    assert unit.status().state == "armed" and unit.status().frames > 0
+
+
+def test_what_is_configured_counts_at_once_and_after_a_restart(tmp_path: Path) -> None:
+    unit = Unit(tmp_path)
+    try:
+        asked, _ = unit.ask(Configure())
+        assert isinstance(asked, Configured) and asked.changed == []
+        assert asked.values["recording.duration_s"] == 0.3
+        needed = unit.status().disk_needed_bytes
+        done, _ = unit.ask(Configure(values={"recording.duration_s": 0.8, "camera.exposure_us": 500}))
+        assert isinstance(done, Configured) and done.changed == ["camera.exposure_us", "recording.duration_s"]
+        # Twice half a second more at 12 Mbit/s.
+        assert unit.status().disk_needed_bytes == needed + 1_500_000
+        camera = unit.status().camera
+        assert camera is not None and camera.exposure_us == 500 and unit.rig.config.camera.exposure_us == 500
+        wrong, _ = unit.ask(Configure(values={"camera.exposure_us": 10**9}))
+        assert (
+            isinstance(wrong, Refusal) and wrong.code == "bad-value" and "camera.exposure_us" in wrong.message
+        )
+        assert isinstance(unit.ask(Arm())[0], Armed)
+        busy, _ = unit.ask(Configure(values={"camera.exposure_us": 600}))
+        assert isinstance(busy, Refusal) and busy.code == "busy"
+        assert isinstance(unit.ask(Configure())[0], Configured)
+    finally:
+        unit.close()
+    unit = Unit(tmp_path)
+    try:
+        camera = unit.status().camera
+        assert camera is not None and camera.exposure_us == 500
+        assert unit.rig.config.recording.duration_s == 0.8
+    finally:
+        unit.close()
+
+
+def test_a_unit_told_to_arm_itself_says_so(unit: Unit) -> None:
+    assert not unit.status().auto_arm
+    unit.ask(Configure(values={"recording.auto_arm": True}))
+    unit.wait(lambda: unit.status().state == "armed")
+    assert unit.status().auto_arm
+    unit.ask(Disarm())
+    assert not unit.status().auto_arm
 
 
 def test_a_second_daemon_on_the_same_folder_is_refused_before_it_touches_anything(

@@ -310,3 +310,70 @@ def test_the_manifest_of_a_run_is_the_documented_one(tmp_path: Path) -> None:
     q = msgspec.to_builtins(manifest.quality)
     assert (q["frames"], q["imu_slots"], q["imu_gaps"], q["edges"]) == (N_FRAMES, 20, 0, 2)
     assert np.isclose(q["imu_late_max_us"], 0.0)
+
+
+def confirmed_run(store: RunStore) -> str:
+    run_id = store.new_run_id("")
+    save(recording(run_id), store.open_writer(run_id), lambda folder: None)
+    store.confirm(run_id, [f.sha256 for f in store.describe(run_id).files])
+    return run_id
+
+
+def test_deleting_needs_a_confirmation_or_force_and_a_run(tmp_path: Path) -> None:
+    store = RunStore(tmp_path, "unit-1", boot_id=BOOT)
+    run_id = confirmed_run(store)
+    (tmp_path / "confirmed" / f"{run_id}.json").unlink()
+    size = sum(p.stat().st_size for p in (tmp_path / "runs" / run_id).iterdir())
+    with pytest.raises(RequestRefusedError, match="pull it first") as e:
+        store.delete(run_id)
+    assert e.value.code == "not-confirmed" and store.count_unconfirmed() == 1
+    store.read_chunk(run_id, 0, 0, 10)  # leaves a file open
+    assert store.delete(run_id, force=True) == size
+    assert list((tmp_path / "runs").iterdir()) == [] and store.list_runs() == []
+    for gone in (run_id, "../confirmed", "", f"{run_id}.partial"):
+        with pytest.raises(RequestRefusedError) as e:
+            store.delete(gone, force=True)
+        assert e.value.code == "no-such-run"
+    with pytest.raises(RequestRefusedError):
+        store.read_chunk(run_id, 0, 0, 10)
+
+
+def test_force_removes_a_folder_that_cannot_be_read(tmp_path: Path) -> None:
+    store = RunStore(tmp_path, "unit-1", boot_id=BOOT)
+    run_id = confirmed_run(store)
+    (tmp_path / "runs" / run_id / "manifest.json").write_text("{")
+    assert RunStore(tmp_path, "unit-1", boot_id=BOOT).delete(run_id, force=True) > 0
+    assert store.count_runs() == 0
+
+
+def test_a_power_cut_while_deleting_leaves_a_whole_run_or_none(tmp_path: Path) -> None:
+    for fail_at in range(1, 5):
+        folder = tmp_path / str(fail_at)
+        run_id = confirmed_run(RunStore(folder, "unit-1", boot_id=BOOT))
+        disk = CutDisk(fail_at)
+        try:
+            RunStore(folder, "unit-1", boot_id=BOOT, disk=disk).delete(run_id)
+        except PowerCut:
+            pass
+        else:
+            assert fail_at > disk.n  # every step was cut once
+            break
+        store = RunStore(folder, "unit-1", boot_id=BOOT)
+        assert store.recover(rebuild_manifest) == []
+        if (folder / "runs" / run_id).exists():
+            assert read_run(folder / "runs" / run_id, verify_hashes=True).manifest.state == "complete"
+        assert not (folder / "deleted").exists()
+    else:
+        pytest.fail("deleting has more steps than were tried")
+
+
+def test_reading_many_files_keeps_only_a_few_open(tmp_path: Path) -> None:
+    store = RunStore(tmp_path, "unit-1", boot_id=BOOT)
+    run_ids = [confirmed_run(store) for _ in range(4)]
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for run_id in run_ids:
+        for i, f in enumerate(store.describe(run_id).files):
+            assert len(store.read_chunk(run_id, i, 0, f.n_bytes)) == f.n_bytes
+    assert 0 < len(list(Path("/proc/self/fd").iterdir())) - before <= 8
+    store.unlock()
+    assert len(list(Path("/proc/self/fd").iterdir())) == before

@@ -1,0 +1,51 @@
+"""Calls that may hang, waited for by a thread that must go on saying that it lives."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from bricktrack_common.errors import HardwareError
+
+_POLL_S = 0.01
+
+T = TypeVar("T")
+
+
+def in_time(what: str, call: Callable[[], T], timeout_s: float, *, beat: Callable[[], None]) -> T:
+    """Return what a call returns; one that hangs is left to its thread.
+
+    Parameters
+    ----------
+    what : str
+        Names the thread, and stands in the error.
+    beat : callable
+        Called while waiting; raises to give up.
+
+    Raises
+    ------
+    HardwareError
+        If the call does not return in time.
+    Exception
+        What the call raised.
+    """
+    results: list[T] = []
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            results.append(call())
+        except BaseException as e:  # noqa: BLE001 - raised again in the caller's thread
+            errors.append(e)
+
+    thread = threading.Thread(target=run, name=f"camera-{what}", daemon=True)
+    thread.start()
+    deadline = time.monotonic() + timeout_s
+    while thread.is_alive() and time.monotonic() < deadline:
+        beat()
+        thread.join(_POLL_S)
+    if errors:
+        raise errors[0]
+    if not results:
+        raise HardwareError(f"{what} hangs: no answer within {timeout_s:g} s. Restart bricktrackd")
+    return results[0]
