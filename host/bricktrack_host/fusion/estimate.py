@@ -6,7 +6,7 @@ one loop over time.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -14,41 +14,17 @@ from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ConfigError, ShapeError
-from bricktrack_common.rotations import nearest_rotation
-from bricktrack_host.fusion.fused_output import sample_motion
-from bricktrack_host.fusion.fusion_problem import (
-    Linearisation,
-    Nodes,
-    NoiseLevel,
-    Run,
-    build_problem,
-    first_linearisation,
-    place_nodes,
-)
+from bricktrack_host.fusion.fused_output import common_part, sample_motion
+from bricktrack_host.fusion.fusion_problem import NoiseLevel, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_signal import chain_rotations
-from bricktrack_host.fusion.noise_choice import frame_chi2, settle_noise
-from bricktrack_host.fusion.smoother import (
-    BA,
-    BG,
-    GRAV,
-    LAG,
-    LOSS,
-    POS,
-    SKEW,
-    TAU,
-    VEL,
-    Estimate,
-    Filter,
-)
+from bricktrack_host.fusion.pose_level import Smoothed, smooth_poses
+from bricktrack_host.fusion.smoother import BA, BG, GRAV, LAG, LOSS, SKEW, TAU, Estimate
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
 logger = logging.getLogger(__name__)
 
 _RUNS_AT_ONCE = 8  # 2000 nodes of four 21 x 21 matrices take 28 MB a run
-_FIRST_FRAMES = 15
-_FIRST_WITHIN_RAD = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,7 +178,8 @@ def fuse_batch(
     return results
 
 
-def _prepare(item: FusionInput) -> Run:
+def prepare_run(item: FusionInput) -> Run:
+    """Return what of one input the smoother uses, with its times aligned."""
     lever_arm_mm = as_float_array("lever_arm_mm", item.lever_arm_mm, (3,))
     if not np.isfinite(lever_arm_mm).all():
         raise ShapeError(f"lever_arm_mm is {lever_arm_mm.tolist()}; expected three finite numbers")
@@ -218,135 +195,54 @@ def _prepare(item: FusionInput) -> Run:
     )
 
 
-def _attitude_at_first_node(run: Run, nodes: Nodes, lin: Linearisation) -> tuple[FloatArray, BoolArray]:
-    """Return the attitude at the first node that most of the early frames agree on, and which frames do.
-
-    The frames are carried back by the gyro. The filter's start is wide and would follow a false first pose
-    anywhere, so the early frames that disagree are not shown to it.
-    """
-    at = nodes.node_of_frame[:_FIRST_FRAMES]
-    k = max(int(at[-1]), 1)
-    step = run.signal.increments(
-        nodes.t_s[:k],
-        nodes.t_s[1 : k + 1],
-        gyro_bias_radps=lin.bg_radps,
-        acc_bias_mps2=lin.ba_mps2,
-        acc_lag_s=lin.lag_s,
-    )
-    since = np.concatenate([np.eye(3)[None], chain_rotations(step.R)])[at]
-    first = run.R_seen[: len(at)] @ np.swapaxes(since, 1, 2)
-    cosine = 0.5 * (np.einsum("iab,jab->ij", first, first) - 1)
-    best = int(np.argmax(np.median(cosine, axis=1)))
-    agrees = np.ones(len(run.t_cam_s), dtype=np.bool_)
-    agrees[: len(at)] = cosine[best] > np.cos(_FIRST_WITHIN_RAD)
-    return nearest_rotation(first[best]), agrees
-
-
-def _relinearise(estimate: Estimate, b: int, n_nodes: int, settings: FusionSettings) -> Linearisation:
-    """Return the linearisation at the first pass's result for run b."""
-    x = estimate.state.x[:n_nodes, b]
-    gravity = x[0, GRAV]
-    return Linearisation(
-        tau_s=float(x[0, TAU]),
-        skew=float(x[0, SKEW]),
-        lag_s=float(x[0, LAG]),
-        loss_s2=max(float(x[0, LOSS]), 0.0),
-        bg_radps=x[:, BG].mean(axis=0),
-        ba_mps2=x[:, BA].mean(axis=0),
-        R_first=nearest_rotation(estimate.state.R[0, b]),
-        v_first_mps=x[0, VEL],
-        p_first_m=x[0, POS],
-        gravity_mps2=gravity * settings.gravity_mps2 / np.linalg.norm(gravity),
-    )
-
-
 def _fuse_together(
     inputs: Sequence[FusionInput], settings: FusionSettings, with_forward: bool
 ) -> list[FusionResult]:
-    runs = [_prepare(item) for item in inputs]
-    lins = [first_linearisation(run, settings) for run in runs]
-    nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
-    starts = [_attitude_at_first_node(*three) for three in zip(runs, nodes, lins, strict=True)]
-    lins = [replace(lin, R_first=R) for lin, (R, _) in zip(lins, starts, strict=True)]
-    used = [agrees for _, agrees in starts]
-    first = settle_noise(runs, lins, nodes, used, settings)
-    scales, levels = first.scales, first.levels
-    for b, far in enumerate(first.chi2):
-        good = far < settings.gate_chi2
-        used[b] = good if good.mean() > 0.5 else used[b]  # else it is not the frames that are wrong
-    # Relinearised once, with what the first pass found of clocks, noise and outliers.
-    lins = [_relinearise(first.estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
-    runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(first.runs, lins, strict=True)]
-    nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
-    for is_last in (False, True):
-        problem, _ = build_problem(
-            runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
-        )
-        passed = Filter(problem)
-        estimate = passed.smooth()
-        chi2 = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
-        # The first pass knew little of the sensors and may have been wrong about a frame at an impact.
-        back = [
-            ~u & (c * min(float(scale.min()), 1.0) ** 2 < settings.gate_chi2)
-            for u, c, scale in zip(used, chi2, scales, strict=True)
-        ]
-        if is_last or not any(b.any() for b in back):
-            break
-        used = [u | b for u, b in zip(used, back, strict=True)]
-    forward = passed.forward() if with_forward else None
-    results = []
-    for b, (item, run, node, lin) in enumerate(zip(inputs, runs, nodes, lins, strict=True)):
-        n = len(node.t_s)
-        x, P = estimate.state.x[:n, b], estimate.covariance[:n, b]
-        n_frames = len(item.optical.t_ns)
-        chi2_of_frame, rejected = np.full(n_frames, np.nan), np.zeros(n_frames, dtype=np.bool_)
-        chi2_of_frame[run.frame], rejected[run.frame] = chi2[b], ~used[b]
-        if rejected.any():
-            logger.warning("%d of %d optical poses left out as outliers", rejected.sum(), len(run.frame))
+    smoothed = smooth_poses([prepare_run(item) for item in inputs], settings)
+    return [_result(item, s, settings, with_forward) for item, s in zip(inputs, smoothed, strict=True)]
 
-        def sample(
-            e: Estimate,
-            *,
-            is_smoothed: bool,
-            run: Run = run,
-            node: Nodes = node,
-            lin: Linearisation = lin,
-            b: int = b,
-            item: FusionInput = item,
-        ) -> FusedTrack:
-            return sample_motion(
-                run, node, lin, problem, e, b,
-                output_t_ns=item.output_t_ns, used=used[b], scale=scales[b], settings=settings,
-                is_smoothed=is_smoothed,
-            )  # fmt: skip
 
-        sd = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2).mean(axis=0), 0.0))
-        results.append(
-            FusionResult(
-                track=sample(estimate, is_smoothed=True),
-                forward=sample(forward, is_smoothed=False) if forward is not None else None,
-                alignment=run.alignment,
-                offset_ns=float(x[0, TAU] * 1e9),
-                offset_sd_ns=float(sd[TAU] * 1e9),
-                skew=float(x[0, SKEW]),
-                skew_sd=float(sd[SKEW]),
-                acc_lag_ns=float(x[0, LAG] * 1e9),
-                acc_lag_sd_ns=float(sd[LAG] * 1e9),
-                acc_loss_s2=float(x[0, LOSS]),
-                acc_loss_sd_s2=float(sd[LOSS]),
-                gyro_bias_radps=x[:, BG].mean(axis=0),
-                gyro_bias_sd_radps=sd[BG],
-                acc_bias_mps2=x[:, BA].mean(axis=0),
-                acc_bias_sd_mps2=sd[BA],
-                gravity_camera_mps2=x[0, GRAV],
-                gravity_sd_mps2=sd[GRAV],
-                frame_chi2=chi2_of_frame,
-                frame_rejected=rejected,
-                mean_nis=float(np.nanmean(passed.nis[:, b])),
-                gyro_noise=levels[b][0],
-                acc_noise=levels[b][1],
-                rotation_noise_scale=float(scales[b][0]),
-                position_noise_scale=float(scales[b][1]),
-            )
-        )
-    return results
+def _result(item: FusionInput, s: Smoothed, settings: FusionSettings, with_forward: bool) -> FusionResult:
+    n = len(s.nodes.t_s)
+    x, P = s.estimate.state.x[:n, s.b], s.estimate.covariance[:n, s.b]
+    n_frames = len(item.optical.t_ns)
+    chi2, rejected = np.full(n_frames, np.nan), np.zeros(n_frames, dtype=np.bool_)
+    chi2[s.run.frame], rejected[s.run.frame] = s.chi2, ~s.used
+    if rejected.any():
+        logger.warning("%d of %d optical poses left out as outliers", rejected.sum(), len(s.run.frame))
+
+    def sample(estimate: Estimate, *, is_smoothed: bool) -> FusedTrack:
+        return sample_motion(
+            s.run, s.nodes, s.problem, estimate, s.b,
+            output_t_ns=item.output_t_ns, seen_cam_s=s.run.t_cam_s[s.used],
+            common=common_part(s.run.cov_seen, s.scale, settings.optical_common_share),
+            settings=settings, is_smoothed=is_smoothed,
+        )  # fmt: skip
+
+    sd = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2).mean(axis=0), 0.0))
+    return FusionResult(
+        track=sample(s.estimate, is_smoothed=True),
+        forward=sample(s.passed.forward(), is_smoothed=False) if with_forward else None,
+        alignment=s.run.alignment,
+        offset_ns=float(x[0, TAU] * 1e9),
+        offset_sd_ns=float(sd[TAU] * 1e9),
+        skew=float(x[0, SKEW]),
+        skew_sd=float(sd[SKEW]),
+        acc_lag_ns=float(x[0, LAG] * 1e9),
+        acc_lag_sd_ns=float(sd[LAG] * 1e9),
+        acc_loss_s2=float(x[0, LOSS]),
+        acc_loss_sd_s2=float(sd[LOSS]),
+        gyro_bias_radps=x[:, BG].mean(axis=0),
+        gyro_bias_sd_radps=sd[BG],
+        acc_bias_mps2=x[:, BA].mean(axis=0),
+        acc_bias_sd_mps2=sd[BA],
+        gravity_camera_mps2=x[0, GRAV],
+        gravity_sd_mps2=sd[GRAV],
+        frame_chi2=chi2,
+        frame_rejected=rejected,
+        mean_nis=float(np.nanmean(s.passed.nis[:, s.b])),
+        gyro_noise=s.levels[0],
+        acc_noise=s.levels[1],
+        rotation_noise_scale=float(s.scale[0]),
+        position_noise_scale=float(s.scale[1]),
+    )

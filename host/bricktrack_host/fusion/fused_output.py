@@ -4,7 +4,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
-from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, Run
+from bricktrack_host.fusion.fusion_problem import Nodes, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.fusion.smoother import (
@@ -28,18 +28,20 @@ from bricktrack_host.tracks import FusedTrack
 def sample_motion(
     run: Run,
     nodes: Nodes,
-    lin: Linearisation,
     problem: Problem,
     estimate: Estimate,
     b: int,
     *,
     output_t_ns: IntArray,
-    used: BoolArray,
-    scale: FloatArray,
+    seen_cam_s: FloatArray,
+    common: FloatArray,
     settings: FusionSettings,
     is_smoothed: bool,
 ) -> FusedTrack:
     """Return the motion of run ``b`` of a batch at instants of camera time.
+
+    ``seen_cam_s``: when the camera saw something that was used, rising. ``common``: covariance, shape (6, 6),
+    of what all that it saw has in common, see `common_part`.
 
     From the node before, the inertial samples carry the state to the instant, so what happened between nodes
     is kept. Where that path misses the node after (it does where the samples are not believed), the miss is
@@ -91,13 +93,13 @@ def sample_motion(
     R_out, p_out, H = observe(state, omega, run.lever_arm_m, t_cam - run.t_mid_s, zero)
     P = H @ cov @ np.swapaxes(H, 1, 2)
     _add_bridge(P, problem, k, b, dt, nodes, is_smoothed=is_smoothed)
-    P = P + _common_part(problem.cov_seen[nodes.node_of_frame, b], scale, settings.optical_common_share)
+    P = P + common
     v_out = v - np.einsum("nij,nj->ni", R_t, np.cross(omega, run.lever_arm_m))
 
     P = 0.5 * (P + np.swapaxes(P, 1, 2))
     P[:, 3:] *= 1e3
     P[:, :, 3:] *= 1e3
-    flags = _flags(run, lin, t_cam, t, used, settings)
+    flags = _flags(run, t_cam, t, seen_cam_s, settings)
     flags[outside] |= int(PoseFlag.EXTRAPOLATED)
     variance = np.diagonal(P, axis1=1, axis2=2)
     unsure = (variance[:, 3:].max(axis=1) > settings.max_position_sd_mm**2) | (
@@ -120,7 +122,7 @@ def sample_motion(
     )
 
 
-def _common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> FloatArray:
+def common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> FloatArray:
     """Return the covariance of errors that the frames have in common; the median frame stands for all.
 
     At least the share that is stated; more where the frames agree with each other better than their
@@ -129,10 +131,13 @@ def _common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> Float
     Parameters
     ----------
     cov_seen : ndarray, shape (n_frames, 6, 6)
-        As stated, times ``scale``.
+        As stated.
     scale : ndarray, shape (2,)
+        Of the stated sd of rotation and position.
+    share : float
+        Of the stated sd that is in common in any case.
     """
-    share_at = np.repeat(np.sqrt(np.maximum(share**2, np.maximum(scale**-2.0 - 1.0, 0.0))), 3)
+    share_at = np.repeat(np.sqrt(np.maximum((share * scale) ** 2, 1.0 - scale**2)), 3)
     return np.asarray(share_at[:, None] * np.median(cov_seen, axis=0) * share_at)
 
 
@@ -158,16 +163,15 @@ def _near_sample(signal: ImuSignal, t_s: FloatArray, marked: BoolArray) -> BoolA
 
 def _flags(
     run: Run,
-    lin: Linearisation,
     t_cam: FloatArray,
     t_imu: FloatArray,
-    used: BoolArray,
+    frames: FloatArray,
     settings: FusionSettings,
 ) -> IntArray:
-    signal, frames = run.signal, run.t_cam_s[used]
+    signal = run.signal
     i = np.clip(np.searchsorted(frames, t_cam), 1, max(len(frames) - 1, 1))
     other = np.minimum(i, len(frames) - 1)
-    period = float(np.median(np.diff(run.t_cam_s))) if len(run.t_cam_s) > 1 else np.inf
+    period = float(np.median(np.diff(frames))) if len(frames) > 1 else np.inf
     away = np.minimum(np.abs(t_cam - frames[other]), np.abs(t_cam - frames[i - 1]))
     slack = 1e-6
     marks = {
