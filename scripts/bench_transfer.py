@@ -29,7 +29,7 @@ sys.path.insert(0, str(HERE.parent / "tests" / "support"))
 from light_unit import idle_unit  # noqa: E402 (the tests' support is no package)
 from run_folders import make_run  # noqa: E402
 
-from bricktrack_host.transfer.pull import pull_run  # noqa: E402
+from bricktrack_host.transfer.run_transfer import pull_run  # noqa: E402
 from bricktrack_host.transfer.unit_client import UnitClient  # noqa: E402
 
 MB = 1_000_000

@@ -197,7 +197,7 @@ def test_an_error_is_one_red_line_without_a_traceback(tmp_path):
 
 
 def test_a_bug_keeps_its_traceback(tmp_path):
-    code = "import bricktrack_host.cli.fleet as f; f.choose_units = None; from bricktrack_host.cli import main; main()"
+    code = "import bricktrack_host.cli.status as f; f.choose_units = None; from bricktrack_host.cli import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", code, "status"], cwd=tmp_path, capture_output=True, text=True, timeout=60
     )

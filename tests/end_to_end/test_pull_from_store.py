@@ -4,17 +4,20 @@ import pytest
 from run_folders import contents, make_run
 
 from bricktrack_common.checksums import crc32
+from bricktrack_common.clocks import read_clock_triplet
 from bricktrack_common.errors import TransferError, UnitError
 from bricktrack_common.wire_messages import (
     Chunk,
     Confirm,
     Confirmed,
     DescribeRun,
+    GetStatus,
     Hello,
     HelloReply,
     ListRuns,
     Read,
     RunList,
+    StatusReply,
 )
 from bricktrack_device.file_server import FileServer
 from bricktrack_device.refusals import RequestRefusedError
@@ -37,6 +40,14 @@ class StoreHandler:
         match request:
             case Hello():
                 answer(HelloReply(unit="b1", software="bricktrack", simulated=True), None)
+            case GetStatus():
+                answer(
+                    StatusReply(
+                        unit="b1", state="idle", runs=2, disk_free_bytes=10**9, disk_needed_bytes=0, frames=0,
+                        imus=[], edges=0, clocks=read_clock_triplet(),
+                    ),
+                    None,
+                )  # fmt: skip
             case ListRuns():
                 answer(RunList(runs=self.store.list_runs()), None)
             case DescribeRun():
@@ -107,7 +118,7 @@ def test_refusals_of_the_real_server_have_their_codes(served):
             (lambda: list(client.read_chunks(RUN, 9, [(0, 10)])), "no-such-file"),
             (lambda: list(client.read_chunks(RUN, 1, [(9_999_999, 10)])), "out-of-range"),
             (lambda: client.confirm(RUN, ["0" * 64]), "hash-mismatch"),
-            (client.status, "bad-message"),
+            (client.disarm, "bad-message"),
         ):
             with pytest.raises(UnitError) as refused:
                 ask()

@@ -26,7 +26,9 @@ from bricktrack_common.wire_messages import (
 from bricktrack_host.transfer import part_folder
 from bricktrack_host.transfer.fleet_config import UnitConfig, unit_at
 from bricktrack_host.transfer.part_folder import JOURNAL_NAME
-from bricktrack_host.transfer.pull import pull_fleet, pull_run, pull_unit
+from bricktrack_host.transfer.contact import Dialer
+from bricktrack_host.transfer.pull import pull_fleet, pull_unit
+from bricktrack_host.transfer.run_transfer import pull_run
 from bricktrack_host.transfer.unit_client import UnitClient
 
 RUN = "fake_9f31_0001_shake"
@@ -53,6 +55,10 @@ def pull(unit, here, **options):
 class Notes:
     def __init__(self):
         self.texts, self.n_bytes, self.total = [], 0, 0
+
+    def unit_started(self, unit): ...
+
+    def unit_done(self, unit): ...
 
     def unit_listed(self, unit, n_runs, n_bytes):
         self.total += n_bytes
@@ -347,7 +353,7 @@ def test_the_systems_own_refusal_to_write_is_a_storage_error(source, here):
 def test_too_little_room_is_said_before_anything_is_fetched(source, here, monkeypatch):
     usage = part_folder.os.statvfs(here)
     monkeypatch.setattr(
-        "bricktrack_host.transfer.pull.shutil.disk_usage",
+        "bricktrack_host.transfer.run_transfer.shutil.disk_usage",
         lambda path: type("U", (), {"free": MIB, "total": usage.f_blocks}),
     )
     with FakeUnit(source.parent) as unit:
@@ -369,7 +375,7 @@ def test_two_pulls_of_one_run_do_not_mix(source, here):
 
 def test_a_unit_of_another_name_is_refused(source, here):
     with FakeUnit(source.parent, name="b2") as unit:
-        result = pull_unit(UnitConfig(name="b1", address=unit.address), here, timeout_s=0.5)
+        result = pull_unit(UnitConfig(name="b1", address=unit.address), here, dialer=Dialer(timeout_s=0.5))
     assert isinstance(result.errors[0], ConfigError)
     assert "calls itself 'b2'" in str(result.errors[0])
 
@@ -383,7 +389,7 @@ def test_several_units_come_side_by_side_and_one_that_fails_does_not_stop_the_re
     units = [FakeUnit(tmp_path / f"card{i}") for i in range(3)]
     with units[0], units[1], units[2]:
         notes = Notes()
-        results = pull_fleet([unit_at(u.address) for u in units], here, progress=notes, timeout_s=0.5)
+        results = pull_fleet([unit_at(u.address) for u in units], here, progress=notes, dialer=Dialer(timeout_s=0.5))
     assert sorted(p.name for p in here.iterdir() if p.name in {f"u{i}_000{j}" for i in range(3) for j in (1, 2)}) == [
         "u0_0001", "u0_0002", "u1_0002", "u2_0001", "u2_0002",
     ]  # fmt: skip

@@ -33,6 +33,7 @@ from bricktrack_common.wire_messages import (
     decode_request,
     encode_message,
 )
+from bricktrack_host.transfer.software import own_software
 
 Message = list[bytes]
 Misbehaviour = Callable[[object, list[Message]], list[Message]]
@@ -51,6 +52,9 @@ class FakeUnit:
         self.requests: list[object] = []
         self.confirmed: set[str] = set()
         self.state = "idle"
+        self.software = own_software()
+        self.auto_arm = False
+        self.last_error = ""
         self.health: list[HealthItem] = []
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
@@ -96,7 +100,7 @@ class FakeUnit:
     def _answer(self, request: object) -> tuple[object, list[bytes]]:
         match request:
             case Hello():
-                return HelloReply(unit=self.name, software="fake", simulated=True), []
+                return HelloReply(unit=self.name, software=self.software, simulated=True), []
             case GetStatus():
                 return self._status(), []
             case Arm(label=label):
@@ -143,6 +147,7 @@ class FakeUnit:
     def _status(self) -> StatusReply:
         return StatusReply(
             unit=self.name, state=self.state, runs=len(self._folders()), disk_free_bytes=10**10,
-            disk_needed_bytes=10**8, frames=0, imus=[], edges=0, health=self.health,
+            disk_needed_bytes=10**8, frames=0, imus=[], edges=0, health=self.health, auto_arm=self.auto_arm,
+            last_error=self.last_error, runs_unconfirmed=len(self._folders()) - len(self.confirmed),
             clocks=read_clock_triplet(),
         )  # fmt: skip

@@ -3,6 +3,7 @@
 import logging
 import sys
 
+import msgspec
 from rich.console import Console
 from rich.logging import RichHandler
 
@@ -22,3 +23,15 @@ def say_error(text: str) -> None:
     line = " ".join(text.split())
     err.print(f"Error: {line}", style="bold red", markup=False, soft_wrap=True)
     sys.stderr.flush()
+
+
+def print_json(value: object, *, indent: bool = True) -> None:
+    """Print a value for scripts: indented, or on one line where more will follow."""
+    text = msgspec.json.encode(value)
+    sys.stdout.write((msgspec.json.format(text, indent=2) if indent else text).decode() + "\n")
+    sys.stdout.flush()
+
+
+def plain(text: str) -> str:
+    """Return text from a unit so that it cannot be taken for markup."""
+    return text.replace("[", r"\[")

@@ -1,20 +1,15 @@
-"""Which units a command is for: those of the fleet file, or one given by its address."""
+"""Which units a command is for, and how they are reached: those of the fleet file, or of given addresses."""
 
 import os
-import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import typer
 
-from bricktrack_common.errors import BricktrackError, ConfigError
-from bricktrack_host.transfer.fleet_config import Fleet, UnitConfig, check_name, load_fleet, unit_at
-from bricktrack_host.transfer.pull import MAX_WORKERS
-from bricktrack_host.transfer.unit_client import UnitClient
-
-T = TypeVar("T")
+from bricktrack_common.errors import ConfigError
+from bricktrack_host.transfer.contact import Dialer
+from bricktrack_host.transfer.fleet_config import Fleet, UnitConfig, load_fleet, unit_at
 
 DEFAULT_FLEET = Path("fleet.toml")
 
@@ -29,7 +24,12 @@ FleetOption = Annotated[
 ]
 UnitOption = Annotated[
     list[str] | None,
-    typer.Option("--unit", "-u", help="Only this unit of the fleet; may be given again.", show_default=False),
+    typer.Option(
+        "--unit",
+        "-u",
+        help="Only this unit of the fleet, or those of a pattern as 'c-*'; may be given again.",
+        show_default=False,
+    ),
 ]
 AddressOption = Annotated[
     list[str] | None,
@@ -40,15 +40,25 @@ AddressOption = Annotated[
         show_default=False,
     ),
 ]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object for scripts.")]
 TimeoutOption = Annotated[
     float, typer.Option("--timeout", min=0.1, max=600, help="Seconds that a unit may be silent.")
 ]
 
 
+@dataclass(frozen=True, slots=True)
+class ChosenUnits:
+    """The units that the options name, how to reach them, and the fleet file's contents if one was used."""
+
+    units: list[UnitConfig]
+    dialer: Dialer
+    fleet: Fleet | None
+
+
 def choose_units(
-    fleet_file: Path | None, names: list[str] | None, addresses: list[str] | None
-) -> tuple[list[UnitConfig], Fleet | None]:
-    """Return the units that the options name, and the fleet file's contents where one was used.
+    fleet_file: Path | None, names: list[str] | None, addresses: list[str] | None, *, timeout_s: float
+) -> ChosenUnits:
+    """Return what the options of a command mean.
 
     Raises
     ------
@@ -58,7 +68,7 @@ def choose_units(
     if addresses:
         if names or fleet_file:
             raise ConfigError("--address stands for itself: give it without --unit and --fleet")
-        return [unit_at(a) for a in dict.fromkeys(addresses)], None
+        return ChosenUnits([unit_at(a) for a in dict.fromkeys(addresses)], Dialer(timeout_s=timeout_s), None)
     path = fleet_file or Path(os.environ.get("BRICKTRACK_FLEET") or DEFAULT_FLEET)
     if fleet_file is None and not path.exists():
         raise ConfigError(
@@ -66,27 +76,4 @@ def choose_units(
             "and give it with --fleet"
         )
     fleet = load_fleet(path)
-    return fleet.select(names), fleet
-
-
-def ask_units(
-    units: list[UnitConfig], question: Callable[[UnitClient], T], *, timeout_s: float
-) -> list[T | BricktrackError]:
-    """Ask all units at once; return each one's answer, or the error it gave, in the order of ``units``."""
-    stop = threading.Event()
-
-    def ask(unit: UnitConfig) -> T | BricktrackError:
-        try:
-            with UnitClient(unit.address, timeout_s=timeout_s, stop=stop) as client:
-                check_name(client.hello(), unit)
-                return question(client)
-        except BricktrackError as e:
-            return e
-
-    with ThreadPoolExecutor(min(MAX_WORKERS, len(units)), "ask") as pool:
-        answers = pool.map(ask, units)
-        try:
-            return list(answers)
-        except BaseException:
-            stop.set()  # Ctrl-C does not wait for a unit that is slow to answer
-            raise
+    return ChosenUnits(fleet.select(names), Dialer(timeout_s=timeout_s), fleet)

@@ -1,142 +1,30 @@
-"""``bricktrack status``, ``arm`` and ``disarm``."""
+"""``bricktrack arm`` and ``disarm``."""
 
-import sys
 import time
 from typing import Annotated
 
-import msgspec
 import typer
-from rich.table import Table
 
 from bricktrack_common.errors import BricktrackError
-from bricktrack_common.wire_messages import StatusReply
-from bricktrack_host.cli._console import err, out, say_error
+from bricktrack_common.wire_messages import Armed, RunSummary, StatusReply
+from bricktrack_host.cli._acknowledged import ask_for, error_details, report_answers
+from bricktrack_host.cli._console import err, out, plain, print_json, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
 from bricktrack_host.cli._units import (
     AddressOption,
+    ChosenUnits,
     FleetOption,
+    JsonOption,
     TimeoutOption,
     UnitOption,
-    ask_units,
     choose_units,
 )
+from bricktrack_host.transfer.contact import ask_units
 from bricktrack_host.transfer.fleet_config import UnitConfig
 
-_STATE_STYLES = {
-    "idle": "green",
-    "armed": "yellow",
-    "recording": "bold red",
-    "saving": "cyan",
-    "fault": "red",
-}
-_HEALTH_STYLES = {"warn": "yellow", "fail": "red"}
-
-
-def status(
-    fleet: FleetOption = None,
-    unit: UnitOption = None,
-    address: AddressOption = None,
-    timeout: TimeoutOption = 3.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object for scripts.")] = False,
-) -> None:
-    """Show how the units are.
-
-    Exits with 1 if a unit does not answer or is in fault.
-
-    For example:
-
-        bricktrack status
-
-        bricktrack status --address tcp://10.0.0.21:41733 --json
-    """
-    units, _ = choose_units(fleet, unit, address)
-    answers = ask_units(units, lambda client: client.status(), timeout_s=timeout)
-    if as_json:
-        _print_json(units, answers)
-    else:
-        _print_table(units, answers)
-    if any(isinstance(a, BricktrackError) or a.state == "fault" for a in answers):
-        raise typer.Exit(EXIT_ERROR)
-
-
-def _print_json(units: list[UnitConfig], answers: list[StatusReply | BricktrackError]) -> None:
-    rows = [
-        {"name": unit.name, "address": unit.address, "answers": False, "error": str(answer)}
-        if isinstance(answer, BricktrackError)
-        else {
-            "name": unit.name,
-            "address": unit.address,
-            "answers": True,
-            "status": msgspec.to_builtins(answer),
-        }
-        for unit, answer in zip(units, answers, strict=True)
-    ]
-    sys.stdout.write(msgspec.json.format(msgspec.json.encode({"units": rows}), indent=2).decode() + "\n")
-
-
-def _print_table(units: list[UnitConfig], answers: list[StatusReply | BricktrackError]) -> None:
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name, justify in (
-        ("unit", "left"), ("state", "left"), ("runs", "right"), ("free", "right"), ("frames", "right"),
-        ("edges", "right"), ("line", "left"), ("imus", "left"), ("temp", "right"), ("health", "left"),
-        ("note", "left"),
-    ):  # fmt: skip
-        right = justify == "right"
-        table.add_column(name, justify="right" if right else "left", no_wrap=name == "state")
-    for unit, answer in zip(units, answers, strict=True):
-        if isinstance(answer, BricktrackError):
-            table.add_row(unit.name, "[red]no answer[/]", *[""] * 9)
-            continue
-        style = _STATE_STYLES[answer.state]
-        table.add_row(
-            _plain(answer.unit),
-            f"[{style}]{answer.state}[/]",
-            str(answer.runs),
-            _free(answer),
-            str(answer.frames)
-            + ("" if answer.frame_age_ms is None else f" ({answer.frame_age_ms:.0f} ms ago)"),
-            str(answer.edges),
-            {True: "high", False: "low", None: "?"}[answer.line_is_high],
-            " ".join(_plain(f"{i.name} {i.problem or _samples(i.samples, i.gaps)}") for i in answer.imus),
-            "" if answer.temperature_degc is None else f"{answer.temperature_degc:.0f} °C",
-            _health(answer),
-            _plain("; ".join(t for t in (answer.run_id, answer.reason, answer.last_error) if t)),
-        )
-    out.print(table)
-    for answer in answers:
-        if isinstance(answer, BricktrackError):
-            say_error(str(answer))
-            continue
-        for item in answer.health:
-            if item.level != "ok":
-                words = f"{answer.unit}: {item.level}: {item.name}: {item.words}. {item.remedy}"
-                err.print(words, style=_HEALTH_STYLES[item.level], markup=False)
-
-
-def _health(answer: StatusReply) -> str:
-    """Return the worst level of a unit's health, and of what; empty for a unit that tells none."""
-    if not answer.health:
-        return ""
-    bad = [item for item in answer.health if item.level != "ok"]
-    if not bad:
-        return "[green]ok[/]"
-    level = "fail" if any(item.level == "fail" for item in bad) else "warn"
-    names = ", ".join(item.name for item in bad if item.level == level)
-    return f"[{_HEALTH_STYLES[level]}]{level}[/]: {_plain(names)}"
-
-
-def _samples(samples: int, gaps: int) -> str:
-    return f"{samples}" + (f" ({gaps} gaps)" if gaps else "")
-
-
-def _free(answer: StatusReply) -> str:
-    text = f"{answer.disk_free_bytes / 1e9:.1f} GB"
-    return f"[red]{text}[/]" if answer.disk_free_bytes < answer.disk_needed_bytes else text
-
-
-def _plain(text: str) -> str:
-    """Return text from a unit so that it cannot be taken for markup."""
-    return text.replace("[", r"\[")
+_POLL_S = 0.5
+_GIVE_UP_S = 60.0
+"""A unit that saves may be slow to answer; one that is silent for longer is gone."""
 
 
 def arm(
@@ -150,6 +38,7 @@ def arm(
     unit: UnitOption = None,
     address: AddressOption = None,
     timeout: TimeoutOption = 5.0,
+    as_json: JsonOption = False,
 ) -> None:
     """Make units ready to record at the next first edge.
 
@@ -159,62 +48,99 @@ def arm(
 
         bricktrack arm --label shake-07 --wait
 
+        bricktrack arm --unit 'c-*' --duration 20
+
         bricktrack arm --address tcp://10.0.0.21:41733
     """
-    units, _ = choose_units(fleet, unit, address)
-    answers = ask_units(units, lambda c: c.arm(label, duration_s=duration), timeout_s=timeout)
+    chosen = choose_units(fleet, unit, address, timeout_s=timeout)
+    answers = ask_for(chosen, lambda c: c.client.arm(label, duration_s=duration), doing="arming")
+    all_armed = report_answers(
+        chosen.units,
+        answers,
+        done="armed",
+        words=lambda armed: f"armed, run {armed.run_id}",
+        details=lambda armed: {"run_id": armed.run_id, "missing": armed.missing},
+        as_json=as_json and not wait,
+    )
     runs: dict[str, str] = {}
-    for one, answer in zip(units, answers, strict=True):
-        if isinstance(answer, BricktrackError):
-            say_error(f"{one.name}: {answer}")
-            continue
-        runs[one.name] = answer.run_id
-        out.print(f"{one.name}: armed, run {answer.run_id}", markup=False)
-        for words in answer.missing:
-            err.print(f"{one.name}: without {words}", style="yellow", markup=False)
-    if len(runs) < len(units):
-        say_error("not all units are armed; 'bricktrack disarm' brings the others back")
+    for one, answer in zip(chosen.units, answers, strict=True):
+        if isinstance(answer, Armed):
+            runs[one.name] = answer.run_id
+            for words in answer.missing:
+                err.print(f"{one.name}: without {words}", style="yellow", markup=False, soft_wrap=True)
+    if not all_armed:
+        if runs:
+            say_error("those that are armed stay so; 'bricktrack disarm' brings them back")
         raise typer.Exit(EXIT_ERROR)
-    if wait and not _wait_until_saved(units, runs, timeout):
+    if wait and not _wait_until_saved(chosen, runs, as_json=as_json):
         raise typer.Exit(EXIT_ERROR)
 
 
-def _wait_until_saved(units: list[UnitConfig], runs: dict[str, str], timeout_s: float) -> bool:
-    """Poll until every unit has its run on the card; tell whether all have."""
-    waiting = list(units)
-    all_good = True
+def _wait_until_saved(chosen: ChosenUnits, runs: dict[str, str], *, as_json: bool) -> bool:
+    """Poll until every unit has its run on the card, or cannot have it; tell whether all have."""
+    waiting = list(chosen.units)
+    heard_s = {u.name: time.monotonic() for u in waiting}
+    outcomes: dict[str, dict[str, object]] = {}
     with err.status("waiting for the first edge") as shown:
         while waiting:
-            answers = ask_units(
-                waiting, lambda client: (client.status(), client.list_runs()), timeout_s=timeout_s
-            )
             left: list[UnitConfig] = []
+            states: dict[str, int] = {}
+            answers = ask_units(
+                waiting, lambda c: (c.client.status(), c.client.list_runs()), dialer=chosen.dialer
+            )
             for one, answer in zip(waiting, answers, strict=True):
-                if isinstance(answer, BricktrackError):  # it may be busy saving: ask again
-                    shown.update(f"{one.name}: {_plain(str(answer))}")
-                    left.append(one)
+                run_id, now_s = runs[one.name], time.monotonic()
+                if isinstance(answer, BricktrackError):
+                    if now_s - heard_s[one.name] < _GIVE_UP_S:
+                        left.append(one)
+                        states["silent"] = states.get("silent", 0) + 1
+                        continue
+                    outcomes[one.name] = {"ok": False, **error_details(answer)}
+                    say_error(f"{one.name}: {run_id}: silent for {_GIVE_UP_S:g} s. {answer}")
                     continue
+                heard_s[one.name] = now_s
                 now, listed = answer
-                saved = next((r for r in listed.runs if r.run_id == runs[one.name]), None)
+                saved = next((r for r in listed.runs if r.run_id == run_id), None)
                 if saved is not None:
-                    good = saved.state == "complete"
-                    out.print(
-                        f"{one.name}: {saved.run_id} {saved.state}, {saved.n_bytes / 1e6:.1f} MB",
-                        markup=False,
-                    )
-                    all_good = all_good and good
-                elif now.state in ("idle", "fault") or (now.run_id and now.run_id != runs[one.name]):
-                    say_error(
-                        f"{one.name}: {runs[one.name]} was not recorded. {now.reason or now.last_error}"
-                    )
-                    all_good = False
+                    outcomes[one.name] = _saved(one.name, saved, as_json=as_json)
+                elif words := _why_it_will_not_come(now, run_id):
+                    outcomes[one.name] = {"ok": False, "error": words, "code": "not-recorded"}
+                    say_error(f"{one.name}: {run_id} was not recorded: {words}")
                 else:
-                    shown.update(", ".join(f"{u.name} {now.state}" for u in [one, *left]))
                     left.append(one)
+                    states[now.state] = states.get(now.state, 0) + 1
             waiting = left
             if waiting:
-                time.sleep(0.5)
-    return all_good
+                shown.update(plain("waiting for runs: " + ", ".join(f"{n} {s}" for s, n in states.items())))
+                time.sleep(_POLL_S)
+    good = all(o["ok"] for o in outcomes.values())
+    if as_json:
+        rows = [
+            {"name": u.name, "address": u.address, "run_id": runs[u.name], **outcomes[u.name]}
+            for u in chosen.units
+        ]
+        print_json({"ok": good, "units": rows})
+    return good
+
+
+def _saved(name: str, run: RunSummary, *, as_json: bool) -> dict[str, object]:
+    if not as_json:
+        out.print(f"{name}: {run.run_id} {run.state}, {run.n_bytes / 1e6:.1f} MB", markup=False)
+    return {"ok": run.state == "complete", "state": run.state, "n_bytes": run.n_bytes}
+
+
+def _why_it_will_not_come(now: StatusReply, run_id: str) -> str:
+    """Return in words why a unit does not have this run and will not; ``""`` while it may."""
+    if now.run_id == run_id:
+        return ""
+    if now.run_id:
+        # What is wrong with that run, or was since it was armed, says nothing of this one.
+        return f"the unit is {now.state} for {now.run_id} now. Look at its log"
+    if now.state == "fault":
+        return now.reason or now.last_error or "the unit is in fault"
+    if now.state == "idle":
+        return now.last_error or "the unit is idle: it was disarmed, or restarted"
+    return ""
 
 
 def disarm(
@@ -222,20 +148,19 @@ def disarm(
     unit: UnitOption = None,
     address: AddressOption = None,
     timeout: TimeoutOption = 5.0,
+    as_json: JsonOption = False,
 ) -> None:
-    """Bring units back to idle without a run; also clears a fault.
+    """Bring units back to idle without a run; also clears a fault, and ends arming by itself.
 
     For example:
 
-        bricktrack disarm --unit b2
+        bricktrack disarm
+
+        bricktrack disarm --unit b2 --json
     """
-    units, _ = choose_units(fleet, unit, address)
-    failed = False
-    for one, answer in zip(units, ask_units(units, lambda c: c.disarm(), timeout_s=timeout), strict=True):
-        if isinstance(answer, BricktrackError):
-            say_error(f"{one.name}: {answer}")
-            failed = True
-        else:
-            out.print(f"{one.name}: idle", markup=False)
-    if failed:
+    chosen = choose_units(fleet, unit, address, timeout_s=timeout)
+    answers = ask_for(chosen, lambda c: c.client.disarm(), doing="disarming")
+    if not report_answers(
+        chosen.units, answers, done="idle", words=lambda _: "idle", details=lambda _: {}, as_json=as_json
+    ):
         raise typer.Exit(EXIT_ERROR)

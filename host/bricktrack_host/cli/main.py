@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bricktrack_host.cli import calibrate, calibrate_leds, demo, fleet, import_cmd, process
+from bricktrack_host.cli import calibrate, calibrate_leds, demo, fleet, import_cmd, process, status
 from bricktrack_host.cli._console import out, set_up_logging
 from bricktrack_host.cli._errors import BricktrackGroup
 from bricktrack_host.cli.pull import make_pull_command
@@ -41,7 +41,7 @@ def _options(
     set_up_logging(verbose)
 
 
-app.command("status")(fleet.status)
+app.command("status")(status.status)
 app.command("arm")(fleet.arm)
 app.command("disarm")(fleet.disarm)
 app.command("pull")(make_pull_command(process.process_pulled))

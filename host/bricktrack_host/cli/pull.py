@@ -1,5 +1,6 @@
 """``bricktrack pull``."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -15,29 +16,50 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
-from bricktrack_common.errors import BricktrackError
-from bricktrack_host.cli._console import err, out, say_error
+from bricktrack_common.errors import BricktrackError, UnitError
+from bricktrack_host.cli._acknowledged import error_details
+from bricktrack_host.cli._console import err, out, print_json, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
-from bricktrack_host.cli._units import AddressOption, FleetOption, TimeoutOption, UnitOption, choose_units
+from bricktrack_host.cli._units import (
+    AddressOption,
+    ChosenUnits,
+    FleetOption,
+    JsonOption,
+    TimeoutOption,
+    UnitOption,
+    choose_units,
+)
 from bricktrack_host.transfer.fleet_config import UnitConfig
-from bricktrack_host.transfer.pull import MAX_WORKERS, PulledRun, UnitPull, pull_fleet
+from bricktrack_host.transfer.pull import (
+    DEFAULT_WORKERS,
+    MAX_WORKERS,
+    PulledRun,
+    PullSettings,
+    UnitPull,
+    pull_fleet,
+)
 
 ProcessHook = Callable[[UnitConfig, PulledRun], None]
 """Processes one pulled run with its unit's calibration and layout; raises `BricktrackError`."""
 
 
 class _Bars:
-    """A bar for each unit and one for all, with rate and time left; notes go above them."""
+    """A bar for each unit under way and one for all, with rate and time left; notes go above them."""
 
-    def __init__(self, progress: Progress, units: list[UnitConfig]) -> None:
+    def __init__(self, progress: Progress, n_units: int) -> None:
         self._progress = progress
-        self._bars: dict[str, TaskID] = {u.name: progress.add_task(u.name, total=None) for u in units}
-        self._all: TaskID | None = progress.add_task("all", total=0) if len(units) > 1 else None
-        self._total = 0
+        self._n_units, self._n_done, self._total = n_units, 0, 0
+        self._bars: dict[str, TaskID] = {}
+        self._all: TaskID | None = progress.add_task("all units", total=0) if n_units > 1 else None
+
+    def unit_started(self, unit: str) -> None:
+        """Show nothing: most units have nothing new when they are watched."""
 
     def unit_listed(self, unit: str, n_runs: int, n_bytes: int) -> None:
+        if not n_runs:
+            return
         words = f"{unit}: {n_runs} run{'' if n_runs == 1 else 's'}"
-        self._progress.update(self._bars[unit], total=n_bytes, description=words)
+        self._bars[unit] = self._progress.add_task(words, total=n_bytes)
         self._total += n_bytes
         if self._all is not None:
             self._progress.update(self._all, total=self._total)
@@ -46,6 +68,14 @@ class _Bars:
         self._progress.advance(self._bars[unit], n_bytes)
         if self._all is not None:
             self._progress.advance(self._all, n_bytes)
+
+    def unit_done(self, unit: str) -> None:
+        self._n_done += 1
+        if self._all is None:
+            return
+        if unit in self._bars:
+            self._progress.remove_task(self._bars.pop(unit))
+        self._progress.update(self._all, description=f"{self._n_done} of {self._n_units} units")
 
     def note(self, unit: str, text: str) -> None:
         self._progress.console.print(f"{unit}: {text}", style="yellow", markup=False, soft_wrap=True)
@@ -71,6 +101,17 @@ def make_pull_command(process: ProcessHook | None = None) -> Callable[..., None]
                 show_default=False,
             ),
         ] = None,
+        disarm: Annotated[
+            bool,
+            typer.Option("--disarm", help="Disarm units that wait for their trigger: they transfer nothing."),
+        ] = False,
+        watch: Annotated[
+            bool,
+            typer.Option("--watch", "-w", help="Go on, and pull each new run as it appears, until Ctrl-C."),
+        ] = False,
+        every: Annotated[
+            float, typer.Option("--every", min=0.2, max=3600, help="Seconds between looks with --watch.")
+        ] = 5.0,
         process_them: Annotated[
             bool,
             typer.Option(
@@ -79,11 +120,15 @@ def make_pull_command(process: ProcessHook | None = None) -> Callable[..., None]
         ] = False,
         timeout: TimeoutOption = 5.0,
         patience: Annotated[
-            float, typer.Option("--patience", min=0, help="Seconds to wait for a unit that went away.")
+            float,
+            typer.Option(
+                "--patience", min=0, help="Seconds to wait for a unit that went away, records or saves."
+            ),
         ] = 60.0,
         jobs: Annotated[
             int, typer.Option("--jobs", "-j", min=1, max=MAX_WORKERS, help="Units at a time.")
-        ] = MAX_WORKERS,
+        ] = DEFAULT_WORKERS,
+        as_json: JsonOption = False,
     ) -> None:
         """Bring runs from units to this machine, verified, and tell the units so.
 
@@ -95,40 +140,85 @@ def make_pull_command(process: ProcessHook | None = None) -> Callable[..., None]
 
             bricktrack pull
 
+            bricktrack pull --watch --process
+
             bricktrack pull --unit b2 --run b2_9f31c2_0007_shake -o runs
 
-            bricktrack pull --address tcp://10.0.0.21:41733 --process
+            bricktrack pull --address tcp://10.0.0.21:41733 --disarm
         """
-        units, fleet_file = choose_units(fleet, unit, address)
-        folder = runs or (fleet_file.runs_path if fleet_file is not None else Path("runs"))
-        columns = (
-            TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(),
-            TransferSpeedColumn(), TimeRemainingColumn(),
-        )  # fmt: skip
-        try:
-            with Progress(*columns, console=err, transient=True) as progress:
-                results = pull_fleet(
-                    units, folder, run_ids=run, progress=_Bars(progress, units), timeout_s=timeout,
-                    patience_s=patience, max_workers=jobs,
-                )  # fmt: skip
-        except KeyboardInterrupt as e:
-            raise KeyboardInterrupt(
-                f"Interrupted. What came is kept in {folder}; 'bricktrack pull' goes on from there."
-            ) from e
-        good = _report(results, run)
-        if process_them and process is not None:
-            for one, result in zip(units, results, strict=True):
-                for pulled in result.runs:
-                    if pulled.outcome == "pulled":
-                        good = _process(process, one, pulled) and good
-        if not good:
+        chosen = choose_units(fleet, unit, address, timeout_s=timeout)
+        folder = runs or (chosen.fleet.runs_path if chosen.fleet is not None else Path("runs"))
+        settings = PullSettings(run_ids=run, disarm=disarm, patience_s=patience, max_workers=jobs)
+        hook = process if process_them else None
+        if watch:
+            _watch(chosen, folder, settings, hook, every, as_json=as_json)
+            return
+        results = _pull(chosen, folder, settings)
+        problems = [(r.unit, e) for r in results for e in r.errors] + _not_found(results, run)
+        problems += _process_all(hook, chosen, results)
+        if as_json:
+            print_json(_for_scripts(results, problems))
+        else:
+            _report(results, said_nothing=run is None)
+        _say(problems)
+        if problems:
             raise typer.Exit(EXIT_ERROR)
 
     return pull
 
 
-def _report(results: list[UnitPull], wanted: list[str] | None) -> bool:
-    good = True
+Problem = tuple[str, BricktrackError]
+
+
+def _pull(chosen: ChosenUnits, folder: Path, settings: PullSettings) -> list[UnitPull]:
+    columns = (
+        TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(), TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    try:
+        with Progress(*columns, console=err, transient=True) as progress:
+            shown = _Bars(progress, len(chosen.units))
+            return pull_fleet(chosen.units, folder, dialer=chosen.dialer, settings=settings, progress=shown)
+    except KeyboardInterrupt as e:
+        raise KeyboardInterrupt(
+            f"Interrupted. What came is kept in {folder}; 'bricktrack pull' goes on from there."
+        ) from e
+
+
+def _watch(
+    chosen: ChosenUnits,
+    folder: Path,
+    settings: PullSettings,
+    hook: ProcessHook | None,
+    every_s: float,
+    *,
+    as_json: bool,
+) -> None:
+    """Pull again and again; say what came, and of each unit's problems only what is new."""
+    told: dict[str, str] = {}
+    n_pulled = 0
+    while True:
+        results = _pull(chosen, folder, settings)
+        came = [UnitPull(r.unit, [p for p in r.runs if p.outcome == "pulled"], r.errors) for r in results]
+        n_pulled += sum(len(r.runs) for r in came)
+        problems = [(r.unit, e) for r in came for e in r.errors]
+        now = {unit: str(e) for unit, e in problems}
+        new = [(unit, e) for unit, e in problems if told.get(unit) != str(e)]
+        new += _process_all(hook, chosen, came)
+        told = now
+        if as_json and (new or any(r.runs for r in came)):
+            print_json(_for_scripts(came, new), indent=False)
+        elif not as_json:
+            _report(came, said_nothing=False)
+        _say(new)
+        try:
+            with err.status(f"watching {len(chosen.units)} units; {n_pulled} runs came, Ctrl-C ends"):
+                time.sleep(every_s)
+        except KeyboardInterrupt:
+            return
+
+
+def _report(results: list[UnitPull], *, said_nothing: bool) -> None:
     for result in results:
         for pulled in result.runs:
             out.print(
@@ -136,25 +226,51 @@ def _report(results: list[UnitPull], wanted: list[str] | None) -> bool:
                 markup=False,
                 soft_wrap=True,
             )
-        for error in result.errors:
-            say_error(f"{result.unit}: {error}")
-            good = False
-        if not result.runs and not result.errors and wanted is None:
+        if said_nothing and not result.runs and not result.errors:
             err.print(f"{result.unit}: no runs", markup=False)
-    came = {pulled.run_id for result in results for pulled in result.runs}
-    asked_for = set(wanted or [])
-    if good and asked_for - came:
-        say_error(
-            f"no unit has the run {', '.join(sorted(asked_for - came))}. 'bricktrack pull' brings all runs"
-        )
-        good = False
-    return good
 
 
-def _process(process: ProcessHook, unit: UnitConfig, pulled: PulledRun) -> bool:
-    try:
-        process(unit, pulled)
-    except BricktrackError as e:
-        say_error(f"{pulled.run_id}: {e}")
-        return False
-    return True
+def _say(problems: list[Problem]) -> None:
+    for name, error in problems:
+        say_error(f"{name}: {error}" if name else str(error))
+
+
+def _not_found(results: list[UnitPull], wanted: list[str] | None) -> list[Problem]:
+    """Return an error about runs that were asked for and that no unit has; none while a unit failed."""
+    missing = set(wanted or []) - {pulled.run_id for result in results for pulled in result.runs}
+    if not missing or any(result.errors for result in results):
+        return []
+    words = f"no unit has the run {', '.join(sorted(missing))}. 'bricktrack pull' brings all runs"
+    return [("", UnitError(words, code="no-such-run"))]
+
+
+def _process_all(hook: ProcessHook | None, chosen: ChosenUnits, results: list[UnitPull]) -> list[Problem]:
+    """Process the runs that came; return what went wrong, by run id."""
+    problems: list[Problem] = []
+    if hook is None:
+        return problems
+    for unit, result in zip(chosen.units, results, strict=True):
+        for pulled in result.runs:
+            if pulled.outcome == "pulled":
+                try:
+                    hook(unit, pulled)
+                except BricktrackError as e:
+                    problems.append((pulled.run_id, e))
+    return problems
+
+
+def _for_scripts(results: list[UnitPull], problems: list[Problem]) -> dict[str, object]:
+    runs = [
+        {
+            "unit": result.unit,
+            "run_id": pulled.run_id,
+            "folder": str(pulled.folder),
+            "outcome": pulled.outcome,
+            "n_bytes": pulled.n_bytes,
+            "n_bytes_fetched": pulled.n_bytes_fetched,
+        }
+        for result in results
+        for pulled in result.runs
+    ]
+    errors = [{"of": name, **error_details(error)} for name, error in problems]
+    return {"ok": not problems, "runs": runs, "errors": errors}

@@ -1,5 +1,6 @@
 """``fleet.toml``: which units there are, where they are reached, and what belongs to each."""
 
+import ipaddress
 import re
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -134,8 +135,8 @@ def load_fleet(path: Path) -> Fleet:
         )
         if unit.server_key and not fleet.host.secret_key:
             raise ConfigError(
-                f"{where}.server_key: the unit asks who we are, and {path} names no key of this host. Make one "
-                "with 'bricktrack keys create' and name it under [host] as secret_key = \"...\""
+                f"{where}.server_key: the unit asks who we are, and {path} names no key of this host. "
+                "Make one with 'bricktrack keys create' and name it under [host] as secret_key"
             )
     return Fleet(
         unit=units,
@@ -154,8 +155,8 @@ def unit_at(address: str) -> UnitConfig:
     return UnitConfig(name=_name_of_address(address), address=address)
 
 
-def check_name(hello: HelloReply, unit: UnitConfig) -> None:
-    """Make sure that a unit is the one the fleet file means.
+def check_name(hello: HelloReply, unit: UnitConfig, address: str) -> None:
+    """Make sure that the unit at an address is the one the fleet file means.
 
     Raises
     ------
@@ -164,9 +165,20 @@ def check_name(hello: HelloReply, unit: UnitConfig) -> None:
     """
     if unit.name not in (hello.unit, _name_of_address(unit.address)):
         raise ConfigError(
-            f"the unit at {unit.address} calls itself {hello.unit!r}; the fleet file calls it {unit.name!r}. "
+            f"the unit at {address} calls itself {hello.unit!r}; the fleet file calls it {unit.name!r}. "
             "Put the addresses right in fleet.toml; 'bricktrack find' tells where each unit is"
         )
+
+
+def is_loopback(address: str) -> bool:
+    """Tell whether an address is this machine's own."""
+    host = urlsplit(address).hostname or ""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _name_of_address(address: str) -> str:

@@ -68,11 +68,11 @@ def test_mistakes_are_named(tmp_path, change, words):
 def test_an_address_alone_is_a_unit_of_any_name():
     unit = unit_at("tcp://[::1]:41733")
     assert unit.name == "at-::1-41733".replace("::", "")
-    check_name(HelloReply(unit="whatever", software="", simulated=True), unit)
+    check_name(HelloReply(unit="whatever", software="", simulated=True), unit, unit.address)
 
 
 def test_a_unit_that_calls_itself_otherwise_is_refused(tmp_path):
     unit = load(tmp_path, GOOD).unit[0]
-    check_name(HelloReply(unit="b1", software="", simulated=True), unit)
+    check_name(HelloReply(unit="b1", software="", simulated=True), unit, unit.address)
     with pytest.raises(ConfigError, match=r"calls itself 'b2'; the fleet file calls it 'b1'"):
-        check_name(HelloReply(unit="b2", software="", simulated=True), unit)
+        check_name(HelloReply(unit="b2", software="", simulated=True), unit, unit.address)
