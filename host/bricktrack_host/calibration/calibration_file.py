@@ -18,15 +18,19 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
 from bricktrack_common.typed_data import convert, dump_json, load_json
+from bricktrack_host.calibration.calibration_file_v1 import upgraded_from_v1
 from bricktrack_host.calibration.central_rays import CentralRays
 from bricktrack_host.calibration.fit_residuals import PlaneResiduals
 from bricktrack_host.calibration.irt import TwoPlaneIrt
 from bricktrack_host.calibration.picture_region import ConvexRegion
 from bricktrack_host.calibration.pixel_polynomials import n_terms
 from bricktrack_host.calibration.ray_calibration import ModelChoice, RayCalibration
+from bricktrack_host.calibration.ray_fit import PlaneNoise
+from bricktrack_host.calibration.rig_tolerance import RigTolerance, RigUnknown
 
 FORMAT = "bricktrack-calibration"
-VERSION = 1
+VERSION = 2
+"""2: walking pupil, covariance between the planes and with misfit, noise and rig. 1 is still read."""
 
 Row = tuple[float, ...]
 Order = Annotated[int, msgspec.Meta(ge=1, le=20)]
@@ -44,8 +48,13 @@ class CentralRaysRecord(
     slope_coefficients_x, slope_coefficients_y : tuple of float
         Of s^i t^j by degree i + j, then by j; s and t are u and v scaled to [-1, 1] across the picture.
     centre_mm : (float, float, float), mm, camera frame
+    walk_mm : float or None, mm
+        How far the pupil walks along the axis for a ray of slope 1; null where it was not let to.
+    covariance_order : int
+        Highest degree of the covariance's terms.
     covariance_lower : tuple of float
-        Lower triangle, row by row, of the covariance of [x coefficients, x0, y coefficients, y0, z0].
+        Lower triangle, row by row, of the covariance of [slope x, x0, slope y, y0, z0] and, with a walking
+        pupil, w; the slopes as coefficients of P_i(s) P_j(t), Legendre polynomials, by degree, then by j.
     covered_px : tuple of (float, float), px
         Polygon around the dots seen at any plane.
     """
@@ -54,6 +63,8 @@ class CentralRaysRecord(
     slope_coefficients_x: Row
     slope_coefficients_y: Row
     centre_mm: tuple[float, float, float]
+    walk_mm: float | None = None
+    covariance_order: Order
     covariance_lower: Row
     covered_px: tuple[tuple[float, float], ...]
 
@@ -69,8 +80,11 @@ class TwoPlaneRecord(
     C_a_mm, D_a_mm, C_b_mm, D_b_mm : tuple of float, mm
         The paper's C (x) and D (y) at planes A and B, of s^i t^j by degree i + j, then by j; s and t are u
         and v scaled to [-1, 1] across the picture.
-    covariance_lower_a, covariance_lower_b : tuple of float, mm^2
-        Lower triangle, row by row, of the covariance of C, and equally of D.
+    covariance_order : int
+        Highest degree of the covariance's terms.
+    covariance_lower : tuple of float, mm^2
+        Lower triangle, row by row, of the covariance of [C at A, C at B, D at A, D at B], as coefficients of
+        P_i(s) P_j(t), Legendre polynomials, by degree, then by j.
     covered_a_px, covered_b_px : tuple of (float, float), px
         Polygons around the dots seen at either plane.
     """
@@ -80,8 +94,8 @@ class TwoPlaneRecord(
     D_a_mm: Row
     C_b_mm: Row
     D_b_mm: Row
-    covariance_lower_a: Row
-    covariance_lower_b: Row
+    covariance_order: Order
+    covariance_lower: Row
     covered_a_px: tuple[tuple[float, float], ...]
     covered_b_px: tuple[tuple[float, float], ...]
 
@@ -133,6 +147,12 @@ class Calibration(
     choice : ModelChoice
         The model taken, why, and the cross-validated errors of the candidates.
     residuals : tuple of PlaneResiduals
+    noise : tuple of PlaneNoise
+        How the dots of each plane scatter about the rays; none in files of version 1.
+    tolerance : RigTolerance
+        How well the planes were said to be known.
+    rig : tuple of RigUnknown
+        What was found of the planes' shifts and turns and of the board's bend, within that tolerance.
     rays : CentralRaysRecord or TwoPlaneRecord
     """
 
@@ -151,13 +171,20 @@ class Calibration(
     plane_b_mm: Millimetres
     choice: ModelChoice
     residuals: tuple[PlaneResiduals, ...]
+    noise: tuple[PlaneNoise, ...] = ()
+    tolerance: RigTolerance = RigTolerance()
+    rig: tuple[RigUnknown, ...] = ()
     rays: CentralRaysRecord | TwoPlaneRecord
 
     @cached_property
     def ray_model(self) -> CentralRays | TwoPlaneIrt:
         """The calibrated rays; a `bricktrack_common.camera_model.RayModel`."""
         r = self.rays
-        m = n_terms(r.order)
+        m, m_covariance = n_terms(r.order), n_terms(r.covariance_order)
+        if r.covariance_order < r.order:
+            raise CalibrationError(
+                f"a covariance of order {r.covariance_order} for rays of order {r.order}: expected as high"
+            )
         if isinstance(r, CentralRaysRecord):
             return CentralRays(
                 sensor_mode=self.sensor_mode,
@@ -166,9 +193,11 @@ class Calibration(
                 order=r.order,
                 coefficients=_rows(m, r.slope_coefficients_x, r.slope_coefficients_y),
                 centre_mm=np.array(r.centre_mm),
-                covariance=_full(r.covariance_lower, 2 * m + 3),
+                covariance_order=r.covariance_order,
+                covariance=_full(r.covariance_lower, 2 * m_covariance + (3 if r.walk_mm is None else 4)),
                 region=_region(r.covered_px),
                 residuals=self.residuals,
+                walk_mm=r.walk_mm or 0.0,
             )
         return TwoPlaneIrt(
             sensor_mode=self.sensor_mode,
@@ -177,8 +206,8 @@ class Calibration(
             order=r.order,
             coefficients_a=_rows(m, r.C_a_mm, r.D_a_mm),
             coefficients_b=_rows(m, r.C_b_mm, r.D_b_mm),
-            covariance_a=_full(r.covariance_lower_a, m),
-            covariance_b=_full(r.covariance_lower_b, m),
+            covariance_order=r.covariance_order,
+            covariance=_full(r.covariance_lower, 4 * m_covariance),
             region_a=_region(r.covered_a_px),
             region_b=_region(r.covered_b_px),
             residuals=self.residuals,
@@ -215,10 +244,12 @@ def make_calibration(
             slope_coefficients_x=_tuple(model.coefficients[0]),
             slope_coefficients_y=_tuple(model.coefficients[1]),
             centre_mm=(float(model.centre_mm[0]), float(model.centre_mm[1]), float(model.centre_mm[2])),
+            walk_mm=model.walk_mm if model.walks else None,
+            covariance_order=model.covariance_order,
             covariance_lower=_lower(model.covariance),
             covered_px=_corners(model.region),
         )
-        how = f"central rays, slopes of order {model.order}"
+        how = "central rays with a walking pupil" if model.walks else "central rays"
     else:
         rays = TwoPlaneRecord(
             order=model.order,
@@ -226,23 +257,21 @@ def make_calibration(
             D_a_mm=_tuple(model.coefficients_a[1]),
             C_b_mm=_tuple(model.coefficients_b[0]),
             D_b_mm=_tuple(model.coefficients_b[1]),
-            covariance_lower_a=_lower(model.covariance_a),
-            covariance_lower_b=_lower(model.covariance_b),
+            covariance_order=model.covariance_order,
+            covariance_lower=_lower(model.covariance),
             covered_a_px=_corners(model.region_a),
             covered_b_px=_corners(model.region_b),
         )
-        how = (
-            f"walking pupil, slopes of order {fitted.choice.order}, stored as two planes"
-            if fitted.choice.model == "walking-pupil"
-            else f"two-plane incident-ray tracking, order {model.order}"
-        )
+        how = "two-plane incident-ray tracking"
+    how += f", {'degrees held by the dots up to' if fitted.choice.held else 'order'} {model.order}"
     return Calibration(
         unit=unit,
         sensor_mode=model.sensor_mode,
         focus_note=focus_note,
         created_utc=(created_utc or datetime.now(UTC)).astimezone(UTC),
         software=f"bricktrack {metadata.version('bricktrack')}",
-        method=f"light-weighted dot centroids, corrected for the discs' distortion; {how}",
+        method="light-weighted dot centroids, weighted by their covariances, corrected for the discs' "
+        f"distortion; {how}",
         simulated=simulated,
         target=target,
         images=images,
@@ -250,6 +279,9 @@ def make_calibration(
         plane_b_mm=model.plane_b_mm,
         choice=fitted.choice,
         residuals=model.residuals,
+        noise=fitted.fit.noise,
+        tolerance=fitted.tolerance,
+        rig=fitted.fit.rig,
         rays=rays,
     )
 
@@ -290,6 +322,8 @@ def load_calibration(path: Path) -> Calibration:
             f"{path}: calibration version {version} is newer than {VERSION}, the newest that this bricktrack "
             f"{metadata.version('bricktrack')} reads; update bricktrack, or calibrate again with this one"
         )
+    if version == 1:
+        data = upgraded_from_v1(data, where=str(path))
     calibration = convert(data, Calibration, where=str(path), error=CalibrationError)
     try:
         _check_rays(calibration)
@@ -355,7 +389,8 @@ def _tuple(values: FloatArray) -> Row:
 
 
 def _lower(matrix: FloatArray) -> Row:
-    return _tuple(matrix[np.tril_indices(len(matrix))])
+    """Return the lower triangle, to nine digits: a covariance is not known better, and files stay small."""
+    return tuple(float(f"{x:.8e}") for x in matrix[np.tril_indices(len(matrix))].tolist())
 
 
 def _corners(region: ConvexRegion) -> tuple[tuple[float, float], ...]:

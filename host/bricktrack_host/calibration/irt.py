@@ -12,12 +12,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.camera_model import Projection, SensorMode
-from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_observations import DotObservations
+from bricktrack_host.calibration.dot_data import Planes, central_start, gather
 from bricktrack_host.calibration.fit_residuals import PlaneResiduals, residuals_of
 from bricktrack_host.calibration.picture_region import ConvexRegion
+from bricktrack_host.calibration.pixel_legendre import legendre_terms, monomials_of_legendre
 from bricktrack_host.calibration.pixel_polynomials import (
     NEAREST_SHARE,
     InverseStart,
@@ -26,18 +26,20 @@ from bricktrack_host.calibration.pixel_polynomials import (
     Which,
     as_points,
     in_chunks,
-    least_squares,
-    left_out_errors,
-    monomials,
+    n_terms,
     newton_inverse,
     picture_grid,
 )
+from bricktrack_host.calibration.ray_families import TwoPlaneFamily, two_plane_rows
+from bricktrack_host.calibration.ray_fit import RayFit, fit_rays, terms_needed
+from bricktrack_host.calibration.ray_uncertainty import UncertainRays
+from bricktrack_host.calibration.rig_tolerance import RigTolerance
 
 PAPER_ORDER = 5
 
 
 @dataclass(frozen=True, eq=False)
-class TwoPlaneIrt:
+class TwoPlaneIrt(UncertainRays):
     """Rays through two polynomial planes; a `bricktrack_common.camera_model.RayModel`.
 
     Attributes
@@ -49,8 +51,11 @@ class TwoPlaneIrt:
         The paper's q.
     coefficients_a, coefficients_b : ndarray, shape (2, n_terms), mm
         C (for x) and D (for y) of the scaled pixel, in the order of `pixel_polynomials.exponents`.
-    covariance_a, covariance_b : ndarray, shape (n_terms, n_terms), mm^2
-        Of C, and equally of D, from the scatter of the dots about the fit.
+    covariance_order : int
+        Highest degree that the covariance speaks of: ``order`` or, with misfit, more.
+    covariance : ndarray, shape (4 n_terms, 4 n_terms), mm^2
+        Of [C at A, C at B, D at A, D at B] as coefficients of Legendre products
+        (`calibration.pixel_legendre`): what the planes have in common is in the blocks off the diagonal.
     region_a, region_b : ConvexRegion
         Hull of the dots seen at either plane.
     residuals : tuple of PlaneResiduals
@@ -62,8 +67,8 @@ class TwoPlaneIrt:
     order: int
     coefficients_a: FloatArray
     coefficients_b: FloatArray
-    covariance_a: FloatArray
-    covariance_b: FloatArray
+    covariance_order: int
+    covariance: FloatArray
     region_a: ConvexRegion
     region_b: ConvexRegion
     residuals: tuple[PlaneResiduals, ...]
@@ -158,38 +163,29 @@ class TwoPlaneIrt:
         """Tell for pixels, shape (..., 2), whether dots surrounded them at both planes."""
         return self.region_a.contains(uv_px) & self.region_b.contains(uv_px)
 
-    def point_sd_mm(self, uv_px: ArrayLike, z_mm: float) -> FloatArray:
-        """Return the standard deviation, shape (...), mm, of x (and of y) on plane z from the fit's noise.
-
-        It says nothing of what the order cannot follow; the cross-validated error does.
-        """
-        uv, shape = as_points("uv_px", uv_px, 2)
-        V = monomials(self._scaling.scaled(uv), self.order)
-        share_b = (z_mm - self.plane_a_mm) / (self.plane_b_mm - self.plane_a_mm)
-        covariance = (1 - share_b) ** 2 * self.covariance_a + share_b**2 * self.covariance_b
-        variance = np.einsum("kn,kl,ln->n", V, covariance, V, optimize=True)
-        return np.asarray(np.sqrt(variance).reshape(shape))
+    def _rows(self, uv_px: FloatArray, z_mm: FloatArray) -> FloatArray:
+        V = legendre_terms(self._scaling.scaled(uv_px), self.covariance_order)
+        return two_plane_rows(V, z_mm, a_mm=self.plane_a_mm, b_mm=self.plane_b_mm)
 
 
 def fit_two_plane_irt(
-    plane_a: DotObservations,
-    plane_b: DotObservations,
+    planes: Planes,
     *,
-    a_mm: float,
-    b_mm: float,
     sensor_mode: SensorMode,
-    order: int = PAPER_ORDER,
+    order: int | None = PAPER_ORDER,
+    tolerance: RigTolerance | None = None,
 ) -> TwoPlaneIrt:
-    """Fit the polynomials of both planes to the dots seen there.
+    """Fit the polynomials of the nearest and the farthest plane to the dots of two or more.
 
     Parameters
     ----------
-    plane_a, plane_b : DotObservations
-    a_mm, b_mm : float, mm
-        Depths of the planes; a < b.
+    planes : sequence of (float, DotObservations)
+        Depth z, mm, and the dots seen there. Dots of planes between bear on both polynomials.
     sensor_mode : SensorMode
-    order : int, optional
-        The paper's q.
+    order : int or None, optional
+        The paper's q; None holds coefficients of high degree as the data say.
+    tolerance : RigTolerance, optional
+        How well the planes are known; exactly by default.
 
     Returns
     -------
@@ -204,38 +200,33 @@ def fit_two_plane_irt(
     -----
     Source paper, eqs 2 and 3.
     """
-    if not 0 < a_mm < b_mm:
-        raise CalibrationError(f"planes at a = {a_mm:g} mm and b = {b_mm:g} mm: expected 0 < a < b")
-    scaling = PixelScaling.of_mode(sensor_mode)
-    coefficients, covariances, residuals = [], [], []
-    for name, dots, z_mm in (("plane A", plane_a, a_mm), ("plane B", plane_b, b_mm)):
-        design = monomials(scaling.scaled(dots.uv_px), order).T
-        c, inverse_normal = least_squares(design, dots.xy_mm, what=f"{name}, order {order}")
-        residual = design @ c - dots.xy_mm
-        freedom = 2 * max(len(dots) - design.shape[1], 1)
-        coefficients.append(c.T.copy())
-        covariances.append(inverse_normal * float(np.sum(residual**2)) / freedom)
-        residuals.append(residuals_of(residual, z_mm=z_mm))
+    fewest = min((len(dots) for _, dots in planes), default=0)
+    data = gather(planes, sensor_mode=sensor_mode, order=terms_needed(order, fewest))
+    family = TwoPlaneFamily(float(central_start(data)[1][2]))
+    fit = fit_rays(data, family, order=order, tolerance=tolerance)
+    return two_plane_irt_of(fit, planes, sensor_mode=sensor_mode)
+
+
+def two_plane_irt_of(fit: RayFit, planes: Planes, *, sensor_mode: SensorMode) -> TwoPlaneIrt:
+    """Return the rays of a fit of `ray_families.TwoPlaneFamily` to planes."""
+    if not isinstance(fit.family, TwoPlaneFamily):
+        raise TypeError(f"a fit of {fit.family.name}; expected one of two planes")
+    planes = sorted(planes, key=lambda p: p[0])
+    (a_mm, dots_a), (b_mm, dots_b) = planes[0], planes[-1]
+    T = fit.family.on_planes(fit.covariance_order, a_mm, b_mm)
+    used = n_terms(fit.order)
+    x_a, x_b, y_a, y_b = (T @ fit.parameters).reshape(4, -1)[:, :used]
+    to_monomials = monomials_of_legendre(fit.order).T
     return TwoPlaneIrt(
         sensor_mode=sensor_mode,
         plane_a_mm=a_mm,
         plane_b_mm=b_mm,
-        order=order,
-        coefficients_a=coefficients[0],
-        coefficients_b=coefficients[1],
-        covariance_a=covariances[0],
-        covariance_b=covariances[1],
-        region_a=ConvexRegion.around(plane_a.uv_px),
-        region_b=ConvexRegion.around(plane_b.uv_px),
-        residuals=tuple(residuals),
+        order=fit.order,
+        coefficients_a=np.stack([x_a, y_a]) @ to_monomials,
+        coefficients_b=np.stack([x_b, y_b]) @ to_monomials,
+        covariance_order=fit.covariance_order,
+        covariance=T @ fit.covariance @ T.T,
+        region_a=ConvexRegion.around(dots_a.uv_px),
+        region_b=ConvexRegion.around(dots_b.uv_px),
+        residuals=tuple(residuals_of(r, z_mm=z) for r, (z, _) in zip(fit.residual_mm, planes, strict=True)),
     )
-
-
-def left_out_errors_mm(
-    dots: DotObservations, fold: IntArray, *, sensor_mode: SensorMode, order: int
-) -> FloatArray:
-    """Return the errors, shape (n, 2), mm, at the dots of one plane left out of its fit fold by fold."""
-    design = monomials(PixelScaling.of_mode(sensor_mode).scaled(dots.uv_px), order).T
-    basis, _ = np.linalg.qr(design)
-    residual = basis @ (basis.T @ dots.xy_mm) - dots.xy_mm
-    return left_out_errors(basis, residual, fold, what=f"two-plane, order {order}")

@@ -165,40 +165,6 @@ def least_squares(design: FloatArray, targets: FloatArray, *, what: str) -> tupl
     return r_inverse @ (q.T @ targets), r_inverse @ r_inverse.T
 
 
-def left_out_errors(basis: FloatArray, residual: FloatArray, fold: IntArray, *, what: str) -> FloatArray:
-    """Return the errors, shape (n, n_targets), at each datum of a linear fit without the datum's fold.
-
-    Exact without fitting again: with H = basis basis' and S a fold, the errors are ``(I - H_SS)^-1`` times
-    the residuals of the fit to all.
-
-    Parameters
-    ----------
-    basis : ndarray, shape (n, n_columns)
-        Orthonormal, spanning the design's columns.
-    residual : ndarray, shape (n, n_targets)
-        Of the fit to all: fit less truth.
-    fold : ndarray of int64, shape (n,)
-    what : str
-        What is being fitted, for the message.
-
-    Raises
-    ------
-    CalibrationError
-        If a fold left out leaves some coefficient undetermined.
-    """
-    errors = np.empty_like(residual)
-    for k in np.unique(fold):
-        own = fold == k
-        rest = np.eye(int(np.count_nonzero(own))) - basis[own] @ basis[own].T
-        try:
-            errors[own] = np.linalg.solve(rest, residual[own])
-        except np.linalg.LinAlgError as e:
-            raise CalibrationError(
-                f"{what}: too few dots to leave some out; take a lower order or more dots"
-            ) from e
-    return errors
-
-
 Which = slice | IntArray
 Evaluate = Callable[[FloatArray, Which], tuple[FloatArray, FloatArray]]
 """Scaled pixels (2, n) and which points they are for -> residual (2, n) and its derivative (2, 2, n)."""
