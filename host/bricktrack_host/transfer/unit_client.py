@@ -17,7 +17,8 @@ from typing import Self, TypeVar
 import zmq
 
 from bricktrack_common.checksums import crc32
-from bricktrack_common.errors import ProtocolError, TransferError, UnitError, UnitTimeoutError
+from bricktrack_common.errors import ConfigError, ProtocolError, TransferError, UnitError, UnitTimeoutError
+from bricktrack_common.key_files import KeyPair, check_public_key
 from bricktrack_common.wire_messages import (
     MAX_CHUNK_BYTES,
     MAX_STILL_BYTES,
@@ -52,6 +53,7 @@ from bricktrack_common.wire_messages import (
     decode_reply,
     encode_message,
 )
+from bricktrack_host.transfer.handshake_watch import HandshakeWatch
 
 logger = logging.getLogger(__name__)
 
@@ -61,6 +63,9 @@ _MAX_TRIES_PER_CHUNK = 4
 _POLL_MS = 200  # how soon a stop is noticed
 
 _Reply_T = TypeVar("_Reply_T")
+
+
+_ORDINARY_SUSPICION = "Is the unit on, bricktrackd running and the address right?"
 
 
 class Stopped(Exception):  # noqa: N818  (not an error: somebody asked for it)
@@ -99,6 +104,18 @@ class UnitClient:
         Default: the process's own.
     stop : threading.Event, optional
         Once it is set, waiting ends with `Stopped`.
+    server_key : str
+        The unit's public key; nothing else is spoken to then, whatever answers at the address. Without it
+        nothing is encrypted, and a unit that has keys does not answer.
+    own_keys : KeyPair, optional
+        This host's; must be given with ``server_key``.
+
+    Raises
+    ------
+    UnitError
+        If the address is none.
+    ConfigError
+        If a key is none, or this host's is missing.
     """
 
     def __init__(
@@ -108,12 +125,21 @@ class UnitClient:
         timeout_s: float = 5.0,
         context: zmq.Context[zmq.Socket[bytes]] | None = None,
         stop: threading.Event | None = None,
+        server_key: str = "",
+        own_keys: KeyPair | None = None,
     ) -> None:
         self.address = address
         self.timeout_s = timeout_s
         self.counts = ClientCounts()
         self._stop = stop
         self._request_ids = itertools.count(1)
+        if server_key:
+            check_public_key(server_key, where=f"{address}: server_key")
+            if own_keys is None:
+                raise ConfigError(
+                    f"{address}: the unit has keys and this host has none; run 'bricktrack keys create' and "
+                    "name the file in fleet.toml: [host] secret_key"
+                )
         self._socket = (context or zmq.Context.instance()).socket(zmq.DEALER)
         for option, value in (
             (zmq.IMMEDIATE, 1),
@@ -127,6 +153,11 @@ class UnitClient:
             (zmq.MAXMSGSIZE, MAX_CHUNK_BYTES + 64 * 1024),
         ):
             self._socket.setsockopt(option, value)
+        if server_key and own_keys is not None:
+            self._socket.curve_serverkey = server_key.encode("ascii")
+            self._socket.curve_publickey = own_keys.public.encode("ascii")
+            self._socket.curve_secretkey = own_keys.secret.encode("ascii")
+        self._handshake = HandshakeWatch(self._socket)
         try:
             self._socket.connect(address)
         except zmq.ZMQError as e:
@@ -146,6 +177,7 @@ class UnitClient:
 
     def close(self) -> None:
         """End the connection; requests under way are forgotten."""
+        self._handshake.close()
         self._socket.close()
 
     def hello(self, software: str = "bricktrack") -> HelloReply:
@@ -328,11 +360,15 @@ class UnitClient:
             left_ms = (deadline_s - time.monotonic()) * 1000
             if self._socket.poll(int(min(max(left_ms, 0), _POLL_MS)), event):
                 return
+            refused = self._handshake.refusal()
+            if refused:
+                raise UnitError(f"{self.address}: {refused}", code="not-allowed")
             if left_ms <= 0:
                 foreign = self.counts.foreign_messages
                 raise UnitTimeoutError(
-                    f"{self.address}: {problem} in time. Is the unit on, bricktrackd running and the address "
-                    "right?" + (f" {foreign} messages came that are not bricktrack's" if foreign else "")
+                    f"{self.address}: {problem} in time. "
+                    + (self._handshake.suspicion() or _ORDINARY_SUSPICION)
+                    + (f" {foreign} messages came that are not bricktrack's" if foreign else "")
                 )
 
 
