@@ -6,7 +6,6 @@ colour and grey limits, rejection by area, radius and eccentricity, plain means.
 """
 
 from dataclasses import dataclass
-from math import ceil, floor, hypot
 
 import cv2
 import numpy as np
@@ -15,22 +14,12 @@ from numpy.typing import NDArray
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import ShapeError
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.centroids import (
-    FLOOR_SD_PX,
-    Spot,
-    find_light,
-    linear_light_of_luma,
-    measure_light,
-)
+from bricktrack_host.tracking import light_kernel as k
+from bricktrack_host.tracking.centroids import flat_bytes, linear_light_of_luma
+from bricktrack_host.tracking.search_kernel import find_lights
 
 Plane = NDArray[np.uint8]
 
-_LEVELS = (0.55, 0.28, 0.12)
-"""Fractions of the brightest light at which the decimated picture is cut: LEDs of one brick differ in
-brightness, and a lamp or a reflection may outshine them."""
-_MAX_CANDIDATES = 40
-_MIN_BOX_SHARE = 0.45
-_MIN_PIXELS = 8  # of a light that a larger window is worth
 _MIN_FILL = 0.90  # a disc behind a straight edge keeps 0.93 and more; rings, arcs and pairs have less
 _MAX_ECCENTRICITY = 0.87  # a hemisphere seen from the side: half a disc, 0.85
 
@@ -97,24 +86,8 @@ class Blobs:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidates:
-    """Where the decimated search found light.
-
-    Attributes
-    ----------
-    uv_px : ndarray, shape (n, 2), px
-        Centres, to about an eighth of the decimation's step times the square root of the light's size.
-    half_size_px : ndarray, shape (n, 2), px
-        Half the bounding box, columns and rows.
-    """
-
-    uv_px: FloatArray
-    half_size_px: FloatArray
-
-
-def find_candidates(picture: Picture, *, radius_px: float | None = None) -> Candidates:
-    """Search the whole picture, decimated, for lights of an LED's size.
+def find_blobs(picture: Picture, *, radius_px: float | None = None) -> Blobs:
+    """Search the whole picture, decimated, for lights of an LED's size, and measure them at full resolution.
 
     Parameters
     ----------
@@ -123,122 +96,36 @@ def find_candidates(picture: Picture, *, radius_px: float | None = None) -> Cand
         About the radius of an LED; sets the decimation (at most 8) and the sizes that are believed: a third
         of it to three times it. Default: from 6 px to an eighth of the picture's height.
     """
-    rows = picture.luma.shape[0]
+    rows, columns = picture.luma.shape
     smallest = 6.0 if radius_px is None else max(radius_px / 3, 2.0)
     largest = rows / 8 if radius_px is None else 3 * radius_px
-    step = int(np.clip(smallest * 1.2, 1, 8))
-    first = step // 2
-    small = np.ascontiguousarray(picture.luma[first::step, first::step])
-    light = linear_light_of_luma()
-    brightest = float(light[int(small.max())])
-    background = float(light[int(np.median(small[::3, ::3]))])
-    owner = np.full(small.shape, -1, dtype=np.int32)
-    centres: list[tuple[float, float]] = []
-    sizes: list[tuple[float, float]] = []
-    low_area, high_area = np.pi * (smallest / step) ** 2 * 0.4, np.pi * (largest / step) ** 2
-    if brightest - background < 0.02:
-        return Candidates(np.empty((0, 2)), np.empty((0, 2)))
-    for fraction in _LEVELS:
-        cut = int(np.searchsorted(light, background + fraction * (brightest - background)))
-        mask = cv2.threshold(small, max(cut - 1, 0), 255, cv2.THRESH_BINARY)[1]
-        _, labels, stats, middles = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
-        width, height, areas = stats[:, 2], stats[:, 3], stats[:, 4]
-        fits = (areas >= low_area) & (areas <= high_area)
-        longest = np.maximum(width, height)
-        fits &= (longest <= 3 * np.minimum(width, height) + 2) & (longest * step <= 2 * largest)
-        # A disc fills 0.79 of its box; lamps' rings and arcs, cables and rims of things do not.
-        fits &= (areas >= _MIN_BOX_SHARE * width * height) | (areas <= 9)
-        for i in np.flatnonzero(fits[1:]) + 1:
-            x, y, w, h, area = (int(s) for s in stats[i])
-            box = (slice(y, y + h), slice(x, x + w))
-            own = labels[box] == i
-            known = owner[box][own]
-            known = known[known >= 0]
-            if known.size and (known.min() != known.max() or area < 0.6 * w * h):
-                continue  # two lights run together at this level, or one light with what surrounds it
-            centre = (first + step * float(middles[i, 0]), first + step * float(middles[i, 1]))
-            size = (0.5 * step * w, 0.5 * step * h)
-            if known.size:  # the same light, cut nearer to its rim
-                centres[known[0]], sizes[known[0]] = centre, size
-                owner[box][own] = known[0]
-            elif len(centres) < _MAX_CANDIDATES:
-                owner[box][own] = len(centres)
-                centres.append(centre)
-                sizes.append(size)
-    return Candidates(np.array(centres).reshape(-1, 2), np.array(sizes).reshape(-1, 2))
+    step = min(max(int(smallest * 1.2), 1), 8)
+    luma, stride = flat_bytes(picture.luma)
+    lights = find_lights(luma, stride, rows, columns, step, smallest, largest, linear_light_of_luma())
+    return _blobs_of(lights, rows, columns)
 
 
-def measure_candidates(picture: Picture, candidates: Candidates) -> Blobs:
-    """Measure the lights of a search at full resolution; those that show none are left out."""
-    spots: list[Spot] = []
-    places: list[tuple[float, float]] = []
-    for uv, half in zip(candidates.uv_px, candidates.half_size_px, strict=True):
-        spot = _measure_window(picture.luma, uv, half)
-        if spot is None:
-            continue
-        u, v = spot.uv_px.tolist()
-        if not any(hypot(u - other[0], v - other[1]) < 2.0 for other in places):
-            spots.append(spot)
-            places.append((u, v))
-    return _blobs_of(spots, picture.luma.shape)
-
-
-def find_blobs(picture: Picture, *, radius_px: float | None = None) -> Blobs:
-    """Return the lights of a picture, searched without any prediction; see `find_candidates`."""
-    return measure_candidates(picture, find_candidates(picture, radius_px=radius_px))
-
-
-def _measure_window(luma: Plane, uv_px: FloatArray, half_px: FloatArray) -> Spot | None:
-    """Measure one light in a window about twice its size, larger where it does not fit."""
-    rows, columns = luma.shape
-    (u, v), (half_u, half_v) = uv_px.tolist(), half_px.tolist()
-    margin_u, margin_v = 8.0 + 0.35 * half_u, 8.0 + 0.35 * half_v
-    for may_grow in (True, True, False):
-        u0, v0 = max(floor(u - half_u - margin_u), 0), max(floor(v - half_v - margin_v), 0)
-        u1, v1 = min(ceil(u + half_u + margin_u) + 1, columns), min(ceil(v + half_v + margin_v) + 1, rows)
-        if u1 - u0 < 4 or v1 - v0 < 4:
-            return None
-        patch = luma[v0:v1, u0:u1]
-        light = find_light(patch, near_px=(u - u0, v - v0))
-        if light is None:
-            return None
-        x, y, w, h = light.box
-        at_border = _at_border((u0 + x, v0 + y, w, h), rows, columns)
-        goes_on = light.touches_window and not at_border
-        inside_a_light = light.background > 0.6 * light.plateau
-        if not (may_grow and (goes_on or inside_a_light) and light.n_pixels >= _MIN_PIXELS):
-            return measure_light(patch, light, origin_px=(u0, v0))
-        margin_u, margin_v = margin_u * 2, margin_v * 2
-    return None
-
-
-def _at_border(box: tuple[int, int, int, int], rows: int, columns: int) -> bool:
-    x, y, w, h = box
-    return x <= 0 or y <= 0 or x + w >= columns or y + h >= rows
-
-
-def _blobs_of(spots: list[Spot], shape: tuple[int, ...]) -> Blobs:
-    if not spots:
+def _blobs_of(lights: FloatArray, rows: int, columns: int) -> Blobs:
+    if not len(lights):
         return _no_blobs()
-    flags = np.zeros(len(spots), dtype=np.int64)
-    areas = np.array([s.area_px2 for s in spots])
-    fill = np.array([s.fill for s in spots])
-    eccentricity = np.array([s.eccentricity for s in spots])
-    flags[[_at_border(s.bbox, shape[0], shape[1]) for s in spots]] |= LedFlag.BORDER
+    areas, eccentricity, fill = lights[:, k.AREA], lights[:, k.ECCENTRICITY], lights[:, k.FILL]
+    u0, v0, width, height = lights[:, k.BOX_U : k.BOX_HEIGHT + 1].T
+    at_border = (u0 <= 0) | (v0 <= 0) | (u0 + width >= columns) | (v0 + height >= rows)
     odd = (fill < _MIN_FILL) | (eccentricity > _MAX_ECCENTRICITY)
-    good = ~odd & (flags == 0)
-    usual = float(np.median(areas[good])) if good.any() else float(np.median(areas))
+    good = ~(odd | at_border)
+    usual = float(np.median(areas[good] if good.any() else areas))
     # Foreshortened domes are small and elongated, near ones large and round: large and elongated are two.
     pair = (areas > 1.4 * usual) & (eccentricity > 0.7)
-    flags[(odd & (areas > 1.3 * usual)) | pair] |= LedFlag.MERGED
-    flags[odd & (areas <= 1.3 * usual)] |= LedFlag.PARTLY_COVERED
+    merged, covered = (odd & (areas > 1.3 * usual)) | pair, odd & (areas <= 1.3 * usual)
     return Blobs(
-        uv_px=np.array([s.uv_px for s in spots]),
-        cov_px2=np.array([s.cov_px2 for s in spots]),
+        uv_px=lights[:, [k.U, k.V]],
+        cov_px2=lights[:, [[k.COV_UU, k.COV_UV], [k.COV_UV, k.COV_VV]]],
         area_px2=areas,
         eccentricity=eccentricity,
         fill=fill,
-        flags=flags,
+        flags=at_border * int(LedFlag.BORDER)
+        | merged * int(LedFlag.MERGED)
+        | covered * int(LedFlag.PARTLY_COVERED),
     )
 
 
@@ -313,7 +200,7 @@ def paper_filter(picture: Picture, *, limits: PaperLimits = _DEFAULT_LIMITS) -> 
     det = np.linalg.det(M)
     # A rim pixel is in or out: its share errs by a uniform +-1/2; the rim has about 2 sqrt(pi area) pixels.
     share_var = 2 * np.sqrt(np.pi * area) / 12
-    cov = 2 * M * (share_var / area**2)[:, None, None] + FLOOR_SD_PX**2 * np.eye(2)
+    cov = 2 * M * (share_var / area**2)[:, None, None] + k.FLOOR_SD_PX**2 * np.eye(2)
     return Blobs(
         uv_px=uv,
         cov_px2=cov,

@@ -4,7 +4,7 @@ from led_scenes import draw_disc, picture_of_light
 
 from bricktrack_common.errors import ShapeError
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.segment import PaperLimits, Picture, find_blobs, find_candidates, paper_filter
+from bricktrack_host.tracking.segment import PaperLimits, Picture, find_blobs, paper_filter
 
 CENTRES = np.array([[300.3, 250.8], [700.6, 300.1], [1200.2, 700.7], [1700.9, 900.4]])
 
@@ -78,7 +78,6 @@ def test_two_lights_run_together_are_flagged():
 
 
 def test_a_dark_picture_has_no_candidates():
-    assert len(find_candidates(picture_of_light(np.full((480, 640), 0.001))).uv_px) == 0
     assert len(find_blobs(picture_of_light(np.full((480, 640), 0.001)))) == 0
 
 
