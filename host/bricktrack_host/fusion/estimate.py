@@ -199,16 +199,27 @@ def _fuse_together(
     inputs: Sequence[FusionInput], settings: FusionSettings, with_forward: bool
 ) -> list[FusionResult]:
     smoothed = smooth_poses([prepare_run(item) for item in inputs], settings)
-    return [_result(item, s, settings, with_forward) for item, s in zip(inputs, smoothed, strict=True)]
+    return [
+        fused_result(item, s, settings, with_forward=with_forward)
+        for item, s in zip(inputs, smoothed, strict=True)
+    ]
 
 
-def _result(item: FusionInput, s: Smoothed, settings: FusionSettings, with_forward: bool) -> FusionResult:
+def fused_result(
+    item: FusionInput,
+    s: Smoothed,
+    settings: FusionSettings,
+    *,
+    with_forward: bool = False,
+    track: FusedTrack | None = None,
+) -> FusionResult:
+    """Return what is given out of one smoothed run; ``track`` where the motion was sampled already."""
     n = len(s.nodes.t_s)
     x, P = s.estimate.state.x[:n, s.b], s.estimate.covariance[:n, s.b]
     n_frames = len(item.optical.t_ns)
     chi2, rejected = np.full(n_frames, np.nan), np.zeros(n_frames, dtype=np.bool_)
     chi2[s.run.frame], rejected[s.run.frame] = s.chi2, ~s.used
-    if rejected.any():
+    if rejected.any() and track is None:
         logger.warning("%d of %d optical poses left out as outliers", rejected.sum(), len(s.run.frame))
 
     def sample(estimate: Estimate, *, is_smoothed: bool) -> FusedTrack:
@@ -221,7 +232,7 @@ def _result(item: FusionInput, s: Smoothed, settings: FusionSettings, with_forwa
 
     sd = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2).mean(axis=0), 0.0))
     return FusionResult(
-        track=sample(s.estimate, is_smoothed=True),
+        track=track or sample(s.estimate, is_smoothed=True),
         forward=sample(s.passed.forward(), is_smoothed=False) if with_forward else None,
         alignment=s.run.alignment,
         offset_ns=float(x[0, TAU] * 1e9),
@@ -240,7 +251,7 @@ def _result(item: FusionInput, s: Smoothed, settings: FusionSettings, with_forwa
         gravity_sd_mps2=sd[GRAV],
         frame_chi2=chi2,
         frame_rejected=rejected,
-        mean_nis=float(np.nanmean(s.passed.nis[:, s.b])),
+        mean_nis=s.passed.mean_nis(s.b),
         gyro_noise=s.levels[0],
         acc_noise=s.levels[1],
         rotation_noise_scale=float(s.scale[0]),

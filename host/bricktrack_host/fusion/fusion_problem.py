@@ -235,7 +235,7 @@ def noise_parts(
     moving = np.linalg.norm(signal.acc_mps2 - np.median(signal.acc_mps2, axis=0), axis=1)
     arm_m = s.lever_arm_sd_mm * 1e-3
 
-    points = t_s[:-1] + np.diff(t_s) * ((np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS)[:, None]
+    points = t_s[:-1] + np.diff(t_s, axis=0) * ((np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS)[:, None]
 
     def at(values: FloatArray, shift_s: float) -> FloatArray:
         return np.asarray(np.interp(points + shift_s, signal.t_s, values).mean(axis=0))

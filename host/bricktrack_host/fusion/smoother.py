@@ -8,13 +8,12 @@ with empty steps. The loops over time are compiled (`smoother_kernel`).
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
-from bricktrack_host.fusion.smoother_kernel import backward_pass, forward_pass
+from bricktrack_host.fusion.smoother_kernel import LedArrays, backward_pass, forward_pass
 
 N_STATES = 22
 ATT, POS, VEL, BG, BA, GRAV = (slice(3 * i, 3 * i + 3) for i in range(6))
@@ -48,6 +47,8 @@ class Problem:
         Where increments and node times were taken.
     start : State
     P_start : ndarray, shape (B, 22, 22)
+    leds : LedArrays or None
+        LEDs as seen, one by one: of the tightly coupled smoother, which has no frames.
     """
 
     dt_s: FloatArray
@@ -76,6 +77,7 @@ class Problem:
     loss_lin: FloatArray
     start: "State"
     P_start: FloatArray
+    leds: LedArrays | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,6 +179,19 @@ def _sensitivities(problem: Problem) -> FloatArray:
     return out
 
 
+_Kept = tuple[
+    bool,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+]
+
+
 class Filter:
     """The forward pass over a batch, kept whole, so that the smoother can run back over it.
 
@@ -206,6 +221,12 @@ class Filter:
             self.log_likelihood[b], _ = _forward(
                 problem, b, self._effect, problem.gyro_var[:, b], problem.acc_var[:, b], kept
             )
+
+    def mean_nis(self, b: int) -> float:
+        """Return the mean of `nis` of one run: 6 of frames, 2 of LEDs, when all is as believed."""
+        leds = self._problem.leds
+        nis = self.nis[:, b] if leds is None else leds.nis[leds.use]
+        return float(np.nanmean(nis)) if np.isfinite(nis).any() else float("nan")
 
     def forward(self) -> Estimate:
         """Return the filtered states: each knows only the past."""
@@ -247,7 +268,19 @@ def score_noise(problem: Problem, gyro_var: FloatArray, acc_var: FloatArray) -> 
     return log_likelihood, last
 
 
-def _nothing_kept(problem: Problem) -> tuple[Any, ...]:
+def _no_leds(shape: tuple[int, ...]) -> LedArrays:
+    none, none3 = np.empty(0), np.empty((0, 3))
+    none33 = np.empty((0, 3, 3))
+    return LedArrays(
+        first=np.zeros((shape[0] + 1, shape[1]), dtype=np.int64),
+        use=np.zeros(0, dtype=np.bool_),
+        dt_s=none, since_mid_s=none, R_step=none33, dv_mps=none3, dp_m=none3, omega_radps=none3,
+        R_lin=none33, t_lin_m=none3, residual_px=np.empty((0, 2)), J=np.empty((0, 2, 6)),
+        cov_px2=np.empty((0, 2, 2)), nis=none, inflation=none,
+    )  # fmt: skip
+
+
+def _nothing_kept(problem: Problem) -> _Kept:
     none3, none2 = np.empty((0, 0, 3, 3)), np.empty((0, 0, N_STATES))
     none4 = np.empty((0, 0, N_STATES, N_STATES))
     scratch = np.empty(problem.has_frame.shape), np.empty(problem.has_frame.shape)
@@ -260,7 +293,7 @@ def _forward(
     effect: FloatArray,
     gyro_var: FloatArray,
     acc_var: FloatArray,
-    kept: tuple[Any, ...],
+    kept: _Kept,
 ) -> tuple[float, FloatArray]:
     """Run the filter over one run of a batch; return the log-likelihood and the last state."""
     pr = problem
@@ -273,5 +306,6 @@ def _forward(
         pr.lever_arm_m[b], pr.bg_lin[b], np.append(pr.ba_lin[b], [pr.lag_lin[b], pr.loss_lin[b]]),
         pr.tau_lin[b], pr.skew_lin[b],
         pr.start.R[b].copy(), x, pr.P_start[b].copy(), *kept,
+        pr.leds or _no_leds(pr.has_frame.shape),
     )  # fmt: skip
     return float(log_likelihood), x

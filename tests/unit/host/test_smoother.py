@@ -218,7 +218,7 @@ def test_runs_of_a_batch_do_not_touch_each_other():
     both = {
         name: np.concatenate([getattr(a, name), getattr(b, name)], axis=0 if name in per_run else 1)
         for name in Problem.__slots__
-        if name != "start"
+        if name not in ("start", "leds")
     }
     start = State(np.concatenate([a.start.R, b.start.R]), np.concatenate([a.start.x, b.start.x]))
     together = Filter(Problem(start=start, **both)).smooth()

@@ -1,0 +1,240 @@
+"""Camera and IMU together, LED by LED: every LED seen counts, at its own row's instant, even one alone.
+
+The pose-level smoother (`pose_level`) comes first: it finds the clocks, the noise and a motion near enough to
+predict the pictures from. Here the measurement is the centroid itself, through the calibrated rays and the
+dome (DESIGN 8.2): nothing of the rolling shutter is left, frames with one or two LEDs still hold the motion,
+and dropouts are rare. Where the two disagree by more than they may, that is said.
+"""
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.fusion.estimate import FusionInput, FusionResult, fused_result, prepare_run
+from bricktrack_host.fusion.fused_output import common_part, sample_motion
+from bricktrack_host.fusion.fusion_problem import Nodes, Run, build_problem, place_nodes
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.imu_signal import seconds_since
+from bricktrack_host.fusion.led_measurements import SeenLeds, led_arrays, led_chi2, picture
+from bricktrack_host.fusion.pose_level import Smoothed, relinearised, smooth_poses
+from bricktrack_host.fusion.smoother import Filter
+from bricktrack_host.fusion.time_alignment import TimeAlignment
+from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
+
+logger = logging.getLogger(__name__)
+
+_PASSES = 3
+_GATE_CHI2 = 20.7  # of 2 degrees of freedom; passed by all but one in 30 000
+_CHI_2_MEDIAN = 1.386  # median of chi-square with 2 degrees of freedom
+_DISAGREE_CHI2 = 22.5  # of 6 degrees of freedom: one in 1000
+_DISAGREE_SHARE = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossCheck:
+    """How far the tightly coupled motion lies from the pose-level one, at the instants of the output.
+
+    Attributes
+    ----------
+    rms_mm, max_mm, max_deg : float
+    share_apart : float
+        Instants at which they are farther apart than the pose-level covariance allows one in 1000.
+    agrees : bool
+        Whether those are few.
+    """
+
+    rms_mm: float
+    max_mm: float
+    max_deg: float
+    share_apart: float
+    agrees: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TightResult:
+    """The tightly coupled motion of one run.
+
+    Attributes
+    ----------
+    fused : FusionResult
+        With the tightly coupled track, clocks and biases; ``frame_chi2`` and ``frame_rejected`` are the
+        pose-level smoother's.
+    pose_level : FusionResult
+        What it began with, kept as the check.
+    check : CrossCheck
+    led_chi2 : ndarray, shape (n_frames, n_leds)
+        Of each LED by all others, squared over its covariance (2 degrees of freedom); NaN where not used.
+    led_rejected : ndarray of bool, shape (n_frames, n_leds)
+        LEDs left out as outliers.
+    centroid_noise_scale : float
+        What the stated sd of the centroids had to be multiplied by.
+    """
+
+    fused: FusionResult
+    pose_level: FusionResult
+    check: CrossCheck
+    led_chi2: FloatArray
+    led_rejected: BoolArray
+    centroid_noise_scale: float
+
+
+def fuse_tight(
+    observations: LedObservations,
+    optical: OpticalTrack,
+    imu: ImuTrack,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    lever_arm_mm: ArrayLike,
+    output_t_ns: IntArray,
+    alignment: TimeAlignment | None = None,
+    settings: FusionSettings | None = None,
+) -> TightResult:
+    """Return the motion of the brick from LED centroids and inertial samples together; static camera.
+
+    Parameters
+    ----------
+    observations : LedObservations
+    optical : OpticalTrack
+        The poses of the same frames, from `bricktrack_host.tracking.optical_track.solve_poses`.
+    imu : ImuTrack
+        In brick axes.
+    ray_model, brick_model : RayModel, BrickModel
+    lever_arm_mm : array_like, shape (3,), mm, brick axes
+        From the origin LED to the IMU.
+    output_t_ns : ndarray of int64, shape (k,), camera time
+    alignment : TimeAlignment, optional
+        Estimated by `align_times` when not given.
+    settings : FusionSettings, optional
+
+    Raises
+    ------
+    TrackingError
+        If there is no optical pose.
+    ShapeError
+        If there are too few inertial samples, or arrays do not fit together.
+    """
+    settings = settings or FusionSettings()
+    item = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment)
+    first = smooth_poses([prepare_run(item)], settings)[0]
+    pose_level = fused_result(item, first, settings)
+    leds = SeenLeds.of(observations, ray_model)
+    leds, smoothed, chi2, use, scale = _smooth_leds(leds, first, ray_model, brick_model, settings)
+    seen_ns = np.unique(optical.t_ns[leds.frame[use]])
+    track = sample_motion(
+        smoothed.run, smoothed.nodes, smoothed.problem, smoothed.estimate, 0,
+        output_t_ns=output_t_ns, seen_cam_s=seconds_since(seen_ns, smoothed.run.signal.epoch_ns),
+        common=common_part(first.run.cov_seen, first.scale, settings.optical_common_share),
+        settings=settings, is_smoothed=True,
+    )  # fmt: skip
+    shape = observations.uv_px.shape[:2]
+    chi2_of_led, rejected = np.full(shape, np.nan), np.zeros(shape, dtype=np.bool_)
+    chi2_of_led[leds.frame, leds.led], rejected[leds.frame, leds.led] = chi2, ~use
+    if rejected.any():
+        logger.warning("%d of %d LED centroids left out as outliers", rejected.sum(), len(use))
+    check = _cross_check(track, pose_level.track)
+    if not check.agrees:
+        logger.warning(
+            "tightly coupled and pose-level motion are up to %.2f mm apart, and by more than they may in "
+            "%.0f %% of the instants",
+            check.max_mm,
+            100 * check.share_apart,
+        )
+    clocks = fused_result(item, smoothed, settings, track=track)
+    fused = replace(
+        clocks, frame_chi2=pose_level.frame_chi2, frame_rejected=pose_level.frame_rejected,
+        rotation_noise_scale=scale, position_noise_scale=scale,
+    )  # fmt: skip
+    return TightResult(fused, pose_level, check, chi2_of_led, rejected, scale)
+
+
+def _smooth_leds(
+    leds: SeenLeds,
+    first: Smoothed,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    settings: FusionSettings,
+) -> tuple[SeenLeds, Smoothed, FloatArray, BoolArray, float]:
+    """Return the LEDs that could be placed, the smoothed states, and how far each lies from the others.
+
+    Pictures are predicted for the pose-level motion, then for what came of it, and so on. Outliers are judged
+    with hindsight each time and may come back.
+    """
+    now, scale = first, 1.0
+    use = np.ones(len(leds.t_ns), dtype=np.bool_)
+    for i in range(_PASSES):
+        R, t_mm = _poses_at(now, leds.t_ns, first.run.t_cam_s, settings)
+        placed = np.asarray(np.isfinite(t_mm).all(axis=1), dtype=np.bool_)
+        leds, use = leds.take(placed), use[placed]
+        pictured = picture(leds, R[placed], t_mm[placed], ray_model, brick_model)
+        use = use & pictured.is_facing
+        lin = relinearised(now.estimate, now.b, len(now.nodes.t_s), settings)
+        run = _without_frames(first.run.with_acc_loss(lin.loss_s2))
+        nodes = Nodes(place_nodes(first.run, lin).t_s, np.zeros(0, dtype=np.int64))
+        problem, _ = build_problem(
+            [run], [nodes], [lin], settings=settings, use_frame=[np.zeros(0, dtype=np.bool_)],
+            noise_scale=[np.ones(2)], levels=[first.levels],
+        )  # fmt: skip
+        problem = replace(
+            problem,
+            leds=led_arrays(
+                leds, pictured, run, nodes, lin, first.levels, scale=scale, use=use, settings=settings
+            ),
+        )
+        passed = Filter(problem)
+        estimate = passed.smooth()
+        chi2 = led_chi2(problem, estimate)
+        now = replace(
+            first, run=run, nodes=nodes, lin=lin, problem=problem, passed=passed, estimate=estimate, b=0
+        )
+        if i < _PASSES - 1:
+            more = max(float(np.sqrt(np.median(chi2[use]) / _CHI_2_MEDIAN)), 1.0 / scale)
+            scale, use = scale * more, (chi2 < _GATE_CHI2 * more**2) & pictured.is_facing
+    return leds, now, chi2, use, scale
+
+
+def _poses_at(
+    s: Smoothed, t_ns: IntArray, seen_cam_s: FloatArray, settings: FusionSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Return smoothed poses at instants, NaN where the motion is not known."""
+    track = sample_motion(
+        s.run, s.nodes, s.problem, s.estimate, s.b, output_t_ns=t_ns, seen_cam_s=seen_cam_s,
+        common=np.zeros((6, 6)), settings=settings, is_smoothed=True,
+    )  # fmt: skip
+    return track.R_camera_brick, track.t_camera_brick_mm
+
+
+def _without_frames(run: Run) -> Run:
+    """Return the run without its poses."""
+    return replace(
+        run,
+        t_cam_s=np.zeros(0),
+        R_seen=np.zeros((0, 3, 3)),
+        p_seen_m=np.zeros((0, 3)),
+        cov_seen=np.zeros((0, 6, 6)),
+    )
+
+
+def _cross_check(track: FusedTrack, pose_level: FusedTrack) -> CrossCheck:
+    both = np.isfinite(track.t_camera_brick_mm[:, 0]) & np.isfinite(pose_level.t_camera_brick_mm[:, 0])
+    if not both.any():
+        return CrossCheck(np.nan, np.nan, np.nan, 1.0, agrees=False)
+    turn = rvec_from_matrix(np.swapaxes(pose_level.R_camera_brick[both], 1, 2) @ track.R_camera_brick[both])
+    shift = track.t_camera_brick_mm[both] - pose_level.t_camera_brick_mm[both]
+    e = np.concatenate([turn, shift], axis=1)
+    chi2 = (e * np.linalg.solve(pose_level.covariance[both], e[..., None])[..., 0]).sum(axis=1)
+    apart = float((chi2 > _DISAGREE_CHI2).mean())
+    away = np.linalg.norm(shift, axis=1)
+    return CrossCheck(
+        rms_mm=float(np.sqrt(np.mean(away**2))),
+        max_mm=float(away.max()),
+        max_deg=float(np.degrees(np.linalg.norm(turn, axis=1).max())),
+        share_apart=apart,
+        agrees=apart <= _DISAGREE_SHARE,
+    )
