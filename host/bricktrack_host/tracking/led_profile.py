@@ -4,8 +4,8 @@ The lit body is a hemisphere on a lit cylinder, the collar, of the same radius. 
 outline is the hull of a circle (the tangent cone of the sphere, cut by the plane across the line of sight)
 and of an ellipse (the collar's rear rim), joined by straight lines: area and centroid have closed forms,
 perspective included. By symmetry the centroid is off the sphere's centre along the projected axis only. From
-the plane across the line of sight to the picture it goes through the ray model, at four points that carry the
-area's second moments, weighted by the local magnification: distortion across an LED is some 0.1 px.
+the plane across the line of sight to the picture it goes by the rays' derivatives, to second order with the
+area's second moments and the growth of the magnification: distortion across an LED is some 0.1 px.
 
 Where the collar was never fitted (`BrickModel.led_profile` is `None`) the outline is taken for the sphere's,
 with an uncertainty along the projected axis that all LEDs share: the pose is then had from what is across the
@@ -17,10 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
+from bricktrack_common.arrays import FloatArray, as_float_array
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import skew
+from bricktrack_host.compiled import compiled
+from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
+from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view, outline
 
 UNKNOWN_SHIFT_PER_RADIUS = 0.1
 """Standard deviation of the unknown shift, in LED radii times the sine of the view angle: between a bare
@@ -29,27 +32,6 @@ hemisphere (+0.19 r at 57 degrees) and a collar of two thirds of r (-0.09 r)."""
 FITTED_SHIFT_PER_RADIUS = 0.005
 """The same for a fitted profile, which is one of shape, not of brightness: limb darkening and the lens's blur
 leave thresholded centroids up to 0.3 px off the outline's at a radius of 60 px (path-traced sample)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LensTerms:
-    """What the curvature of the map to the picture adds across an LED, beyond its derivative at the centre.
-
-    Some 0.3 px that change by a thousandth of that while a pose is refined: had once, they serve for all its
-    steps, which then cost one projection in place of five.
-
-    Attributes
-    ----------
-    uv_px : ndarray, shape (..., 2), px
-    J_px_per_mm : ndarray, shape (..., 2, 3), px/mm
-    """
-
-    uv_px: FloatArray
-    J_px_per_mm: FloatArray
-
-    def take(self, which: IntArray) -> "LensTerms":
-        """Return the terms of some frames."""
-        return LensTerms(self.uv_px[which], self.J_px_per_mm[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +52,6 @@ class LedPrediction:
         Cosine between the axis and the line of sight to the camera; an LED with 0 or less cannot be seen.
     model_shift_px : ndarray, shape (..., 2), px
         One standard deviation of what the profile leaves unknown, the same way in all LEDs of a type.
-    lens : LensTerms
-        What the map's curvature across the LED contributed.
     """
 
     uv_px: FloatArray
@@ -80,7 +60,6 @@ class LedPrediction:
     area_px2: FloatArray
     facing: FloatArray
     model_shift_px: FloatArray
-    lens: LensTerms
 
 
 def outline_moments(
@@ -106,36 +85,18 @@ def outline_moments(
     Without collar and from afar the centroid is ``(4 r / 3 pi)(1 - c)``. Green's theorem over half the
     outline: the circle's arc to the common tangent, the tangent, the ellipse's arc.
     """
-    c, r, h, D = np.broadcast_arrays(
-        *(np.asarray(x, dtype=np.float64) for x in (facing, radius_mm, collar_mm, distance_mm))
-    )
-    s = np.sqrt(np.maximum(1 - c * c, 0.0))
-    rho = r / np.sqrt(1 - (r / D) ** 2)
-    far, near = (-h * s + r * c) / (D + h * c + r * s), (-h * s - r * c) / (D + h * c - r * s)
-    x_e, p = 0.5 * D * (far + near), 0.5 * D * np.abs(far - near)
-    k = r * s / (D + h * c)
-    q = r * D / ((D + h * c) * np.sqrt(1 - k * k))
-    # Common tangent: (rho - x_e x)^2 = q^2 + (p^2 - q^2) x^2 with x the cosine of its normal's angle.
-    root = np.sqrt(np.maximum(rho**2 * x_e**2 - (x_e**2 + q**2 - p**2) * (rho**2 - q**2), 0.0))
-    x = np.clip((rho**2 - q**2) / np.minimum(rho * x_e - root, -1e-12), -1.0, 1.0)
-    phi = np.arccos(x)
-    sin_phi = np.sin(phi)
-    theta = np.arctan2(q * sin_phi, p * x)
-    sin_t, cos_t = np.sin(theta), np.cos(theta)
-    cos2 = 0.5 * (np.pi - theta) - 0.5 * sin_t * cos_t  # integral of cos^2 from theta to pi
-    cos3 = -(sin_t - sin_t**3 / 3)
-    x1, y1 = rho * x, rho * sin_phi
-    x2, y2 = x_e + p * cos_t, q * sin_t
-    half_area = (
-        0.5 * rho**2 * (phi + sin_phi * x) + 0.5 * (x1 + x2) * (y2 - y1) + q * (-x_e * sin_t + p * cos2)
-    )
-    half_moment = (
-        0.5 * rho**3 * (sin_phi - sin_phi**3 / 3)
-        + (x1 * x1 + x1 * x2 + x2 * x2) * (y2 - y1) / 6
-        + 0.5 * q * (-(x_e**2) * sin_t + 2 * x_e * p * cos2 + p**2 * cos3)
-    )
-    rear = np.minimum(x_e - p, -rho * (x <= -1 + 1e-12))
-    return 2 * half_area, half_moment / half_area, 0.5 * (rho - rear)
+    given = np.broadcast_arrays(facing, radius_mm, collar_mm, distance_mm)
+    flat = np.stack([np.asarray(x, dtype=np.float64).ravel() for x in given])
+    area, centroid, half_length = _outlines(flat).reshape(3, *given[0].shape)
+    return area, centroid, half_length
+
+
+@compiled
+def _outlines(given: FloatArray) -> FloatArray:
+    out = np.empty((3, given.shape[1]))
+    for i in range(given.shape[1]):
+        out[0, i], out[1, i], out[2, i] = outline(given[0, i], given[1, i], given[2, i], given[3, i])
+    return out
 
 
 def predict_leds(
@@ -145,7 +106,6 @@ def predict_leds(
     ray_model: RayModel,
     *,
     collar_mm: float | None,
-    lens: LensTerms | None = None,
 ) -> LedPrediction:
     """Predict what a camera sees of LEDs.
 
@@ -159,80 +119,64 @@ def predict_leds(
     ray_model : RayModel
     collar_mm : float or None
         `None`: not fitted; see the module.
-    lens : LensTerms, optional
-        Of a prediction nearby; default from four more projections.
     """
     centres = as_float_array("centres_camera_mm", centres_camera_mm, (..., 3))
     axes = as_float_array("axes_camera", axes_camera, (..., 3))
-    radii = np.broadcast_to(np.asarray(radii_mm, dtype=np.float64), centres.shape[:-1])
-    at_centre = ray_model.project(centres)
-    J0 = at_centre.J_px_per_mm
-    # The line of sight is the direction that does not move the image; no projection centre is needed.
-    d = np.cross(J0[..., 0, :], J0[..., 1, :])
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    d *= np.where(d[..., 2:] < 0, -1.0, 1.0)
-    along = np.einsum("...i,...i->...", axes, d)
-    facing = -along
-    across = axes - along[..., None] * d
-    s = np.linalg.norm(across, axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        other = np.cross(d, np.broadcast_to([1.0, 0.0, 0.0], d.shape))
-        other /= np.linalg.norm(other, axis=-1, keepdims=True)
-        e1 = np.where(s[..., None] > 1e-6, across / s[..., None], other)
-    e2 = np.cross(d, e1)
-    distance = centres[..., 2] / d[..., 2]
-    if collar_mm is None:  # the sphere's own outline, and a shift along the projected axis that is not known
-        half_length = radii / np.sqrt(1 - (radii / distance) ** 2)
-        area, per_s, slope = np.pi * half_length**2, np.zeros_like(s), np.zeros_like(s)
-        unknown_mm = UNKNOWN_SHIFT_PER_RADIUS * radii * s
-    else:
-        step = 1e-4
-        c = np.clip(facing, -1 + 2 * step, 1 - 2 * step)
-        near = np.stack([c, c - step, c + step])
-        areas, shifts, half_lengths = outline_moments(
-            near, radius_mm=radii, collar_mm=collar_mm, distance_mm=distance
-        )
-        ratio = shifts / np.sqrt(1 - near**2)
-        area, half_length, per_s = areas[0], half_lengths[0], ratio[0]
-        slope = (ratio[2] - ratio[1]) / (2 * step)
-        unknown_mm = FITTED_SHIFT_PER_RADIUS * radii * s
-    offset = (per_s * s)[..., None] * e1
-    uv_flat = at_centre.uv_px + np.einsum("...ij,...j->...i", J0, offset)
-    if lens is None:
-        # Four points with the area's second moments: exact for a quadratic map.
-        spread = np.sqrt(0.5) * np.stack([half_length, radii])[..., None] * np.stack([e1, e2])
-        seen = ray_model.project(centres + offset + np.concatenate([spread, -spread]))
-        weight = _magnification(seen.J_px_per_mm, e1, e2)
-        weight /= weight.sum(axis=0)
-        lens = LensTerms(
-            uv_px=np.einsum("k...,k...i->...i", weight, seen.uv_px) - uv_flat,
-            J_px_per_mm=np.einsum("k...,k...ij->...ij", weight, seen.J_px_per_mm) - J0,
-        )
-    J = J0 + lens.J_px_per_mm
-    # shift = per_s(c) * across(n), c = -n.d: its derivative by the axis n.
-    dd = d[..., :, None] * d[..., None, :]
-    d_shift = per_s[..., None, None] * (np.eye(3) - dd) - slope[..., None, None] * (
-        across[..., :, None] * d[..., None, :]
+    lead = centres.shape[:-1]
+    radii = np.broadcast_to(np.asarray(radii_mm, dtype=np.float64), lead)
+    uv = ray_model.project(centres).uv_px
+    polynomials = hit_polynomials(ray_model)
+    hits = expand_at(polynomials, uv)
+    a, b = polynomials.plane_a_mm, polynomials.plane_b_mm
+    flat, J_centre, J_axis = _predict_all(
+        uv.reshape(-1, 2),
+        np.ascontiguousarray(centres.reshape(-1, 3)),
+        np.ascontiguousarray(axes.reshape(-1, 3)),
+        radii.reshape(-1),
+        np.nan if collar_mm is None else collar_mm,
+        hits.reshape(-1, 6, 4),
+        a,
+        b - a,
     )
-    # Moving the LED turns its line of sight d, and with it what is seen of the shift.
-    turned = (facing * per_s / distance)[..., None, None] * (np.eye(3) - dd)
-    turned -= (slope / distance)[..., None, None] * across[..., :, None] * across[..., None, :]
+    out = flat.reshape(*lead, 6)
     return LedPrediction(
-        uv_px=uv_flat + lens.uv_px,
-        J_px_per_mm=J @ (np.eye(3) + turned),
-        J_px_per_axis=J @ d_shift,
-        area_px2=area * _magnification(J, e1, e2),
-        facing=facing,
-        model_shift_px=unknown_mm[..., None] * np.einsum("...ij,...j->...i", J, e1),
-        lens=lens,
+        uv_px=out[..., :2],
+        J_px_per_mm=J_centre.reshape(*lead, 2, 3),
+        J_px_per_axis=J_axis.reshape(*lead, 2, 3),
+        area_px2=out[..., 2],
+        facing=out[..., 3],
+        model_shift_px=shift_per_radius(collar_mm) * radii[..., None] * out[..., 4:],
     )
 
 
-def _magnification(J_px_per_mm: FloatArray, e1: FloatArray, e2: FloatArray) -> FloatArray:
-    """Return the picture's area per area of the plane that e1 and e2 span, px^2/mm^2."""
-    a = np.einsum("...ij,...j->...i", J_px_per_mm, e1)
-    b = np.einsum("...ij,...j->...i", J_px_per_mm, e2)
-    return np.asarray(np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]))
+def shift_per_radius(collar_mm: float | None) -> float:
+    """Return one standard deviation of what the profile leaves unknown, over radius times sine."""
+    return UNKNOWN_SHIFT_PER_RADIUS if collar_mm is None else FITTED_SHIFT_PER_RADIUS
+
+
+@compiled
+def _predict_all(
+    uv: FloatArray,
+    centres: FloatArray,
+    axes: FloatArray,
+    radii: FloatArray,
+    collar: float,
+    hits: FloatArray,
+    plane_a: float,
+    apart: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return centroid, area, facing and what is across the axis, (n, 6), and both Jacobians, (n, 2, 3)."""
+    n = len(uv)
+    out, J_centre, J_axis = np.empty((n, 6)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
+    shape = np.empty(N_SHAPE)
+    for i in range(n):
+        led_shape(centres[i], axes[i], radii[i], collar, hits[i], plane_a, apart, shape)
+        du, dv, facing, magnification = led_view(
+            centres[i], axes[i], hits[i], plane_a, apart, shape, J_centre[i], J_axis[i], out[i, 4:]
+        )
+        out[i, 0], out[i, 1] = uv[i, 0] + du, uv[i, 1] + dv
+        out[i, 2], out[i, 3] = shape[AREA] * magnification, facing
+    return out, J_centre, J_axis
 
 
 def predict_brick(
@@ -242,7 +186,6 @@ def predict_brick(
     brick_model: BrickModel,
     *,
     collar_mm: float | None,
-    lens: LensTerms | None = None,
 ) -> tuple[LedPrediction, FloatArray]:
     """Predict all LEDs of bricks, and the derivative of their pixels by the pose.
 
@@ -263,9 +206,7 @@ def predict_brick(
     P, N = brick_model.led_positions_mm, brick_model.led_axes
     centres = np.einsum("nlij,lj->nli", np.broadcast_to(R, (R.shape[0], len(P), 3, 3)), P) + t
     axes = np.einsum("nlij,lj->nli", np.broadcast_to(R, (R.shape[0], len(P), 3, 3)), N)
-    prediction = predict_leds(
-        centres, axes, brick_model.led_radii_mm, ray_model, collar_mm=collar_mm, lens=lens
-    )
+    prediction = predict_leds(centres, axes, brick_model.led_radii_mm, ray_model, collar_mm=collar_mm)
     J = np.empty((*centres.shape[:2], 2, 6))
     J[..., :3] = -(prediction.J_px_per_mm @ (R @ skew(P)) + prediction.J_px_per_axis @ (R @ skew(N)))
     J[..., 3:] = prediction.J_px_per_mm

@@ -13,17 +13,19 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
-from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.led_profile import LedPrediction, LensTerms, predict_brick
+from bricktrack_host.tracking.hit_polynomials import HitPolynomials, expand_at, hit_polynomials
+from bricktrack_host.tracking.led_profile import shift_per_radius
+from bricktrack_host.tracking.refine_kernel import Fitted, Model, Observed, fit_frames
 
 HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
 OUTLIER_SIGMAS = 5.0
 MIN_LEDS = 4
-_LENS_MM, _LENS_RAD = 0.5, 0.02
-"""Moved less than this, the lens terms of the start are good to 0.002 px."""
-_DONE_SIGMAS = 1e-3  # a last step this small, and the next smaller still, is far below the pose's own error
+_OWN_SHARE = 0.5
+"""Of what the profile leaves unknown, each LED's own part beside the common one: bodies between a bare
+hemisphere and one with a collar of 2 r / 3, seen at 5 to 57 degrees, differ so much from one factor."""
+_CHUNK_FRAMES = 1024  # their rays fit into a core's second-level cache
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +72,7 @@ class RefinedPoses:
         Robust (Huber) cost, twice: about ``2 n_used - 6`` where the model holds.
     n_used : ndarray of int, shape (n,)
     area_px2, facing : ndarray, shape (n, n_leds)
-        Predicted, see `led_profile.LedPrediction`.
+        Predicted, see `led_profile.LedPrediction`; NaN where not seen.
     """
 
     R_camera_brick: FloatArray
@@ -90,24 +92,6 @@ class RefinedPoses:
         for name, value in values.items():
             value[rows] = getattr(by, name)
         return RefinedPoses(**values)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Evaluation:
-    cost: FloatArray
-    A: FloatArray
-    g: FloatArray
-    shift: FloatArray
-    residual: FloatArray
-    sigmas: FloatArray
-    area: FloatArray
-    facing: FloatArray
-    lens: LensTerms
-
-    def put(self, rows: IntArray, by: "_Evaluation", which: BoolArray | slice) -> None:
-        """Replace the frames ``rows`` by the frames ``which`` of another evaluation."""
-        for name in ("cost", "A", "g", "shift", "residual", "sigmas", "area", "facing"):
-            getattr(self, name)[rows] = getattr(by, name)[which]
 
 
 def refine_poses(
@@ -140,15 +124,15 @@ def refine_poses(
         Rolling shutter; default none.
     max_steps : int
         Frames stop when their step is a thousandth of their uncertainty; two to four do from PRSOI.
-
     profile_is_exact : bool
         True: no uncertainty of the profile, for fitting it and for tests.
 
     Notes
     -----
-    Levenberg-Marquardt damping frame by frame, so that no step raises the Huber cost. The covariance is the
-    inverse of the normal matrix with the robust weights, undamped. An unfitted LED profile shifts all LEDs of
-    a type alike, so its part of the covariance is that of one common unknown, not of independent ones.
+    Levenberg-Marquardt damping frame by frame, so that no step raises the Huber cost. What the profile leaves
+    unknown shifts all LEDs of a type alike: it is one more unknown of the frame, with its prior; in part it
+    differs from LED to LED, as their views do, and adds to their covariances. The pose's covariance is its
+    block of the inverse of the normal matrix with the robust weights, undamped.
     """
     n, n_leds = uv_px.shape[:2]
     if uv_px.shape != (n, brick_model.n_leds, 2) or cov_px2.shape != (n, n_leds, 2, 2):
@@ -160,175 +144,81 @@ def refine_poses(
     seen = all_finite(uv_px) & all_finite(cov_px2, 2)
     started = all_finite(R_start, 2) & all_finite(t_start_mm)
     frames = np.flatnonzero((seen.sum(axis=1) >= MIN_LEDS) & started)
-    if frames.size == 0:
-        return out
-    state_R, state_t = R_start[frames].copy(), t_start_mm[frames].copy()
-    start = _State(state_R, state_t, np.zeros((frames.size, 6)))
-    problem = _Problem(uv_px, cov_px2, seen, ray_model, brick_model, collar_mm, profile_is_exact, motion)
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        # A false start may put LEDs beside or behind the pupil: its cost is then infinite or NaN.
-        state = problem.evaluate(frames, start, None)
-        _descend(problem, state, frames, start, max_steps)
-        moved = np.linalg.norm(start.t - t_start_mm[frames], axis=1) > _LENS_MM
-        moved |= np.linalg.norm(start.R - R_start[frames], axis=(1, 2)) > _LENS_RAD
-        moved &= np.isfinite(state.cost)
-        if moved.any():  # the lens terms are of the start: have them anew
-            again = np.flatnonzero(moved)
-            there = start.take(again)
-            fresh = problem.evaluate(frames[again], there, None)
-            _descend(problem, fresh, frames[again], there, 3)
-            start.put(again, there, slice(None))
-            state.put(again, fresh, slice(None))
-    R, t = start.R, start.t
-    good = np.isfinite(state.cost)
-    condition = np.linalg.cond(state.A[good]) if good.any() else np.zeros(0)
-    good[np.flatnonzero(good)[condition > 1e14]] = False
-    rows = frames[good]
-    out.R_camera_brick[rows], out.t_camera_brick_mm[rows] = R[good], t[good]
-    inverse = np.linalg.inv(state.A[good])
-    shared = np.einsum("nij,nj->ni", inverse, state.shift[good])
-    out.covariance[rows] = (inverse + shared[:, :, None] * shared[:, None, :])[:, :6, :6]
-    out.residual_px[rows], out.sigmas[rows] = state.residual[good], state.sigmas[good]
-    out.is_outlier[rows] = np.nan_to_num(state.sigmas[good]) > OUTLIER_SIGMAS
-    out.chi2[rows] = state.cost[good]
-    out.n_used[rows] = (seen[rows] & ~out.is_outlier[rows]).sum(axis=1)
-    out.area_px2[rows], out.facing[rows] = state.area[good], state.facing[good]
+    model = _model(ray_model, brick_model, collar_mm, profile_is_exact)
+    polynomials = hit_polynomials(ray_model)
+    for first in range(0, frames.size, _CHUNK_FRAMES):
+        rows = frames[first : first + _CHUNK_FRAMES]
+        observed = _observed(uv_px[rows], cov_px2[rows], seen[rows], polynomials, motion, rows)
+        fitted = _fitted(R_start[rows], t_start_mm[rows], n_leds)
+        fit_frames(observed, model, fitted, max_steps)
+        good = np.isfinite(fitted.cost)
+        to = rows[good]
+        out.R_camera_brick[to], out.t_camera_brick_mm[to] = fitted.R[good], fitted.t[good]
+        out.covariance[to], out.chi2[to] = fitted.covariance[good], fitted.cost[good]
+        out.residual_px[to], out.sigmas[to] = fitted.residual[good], fitted.sigmas[good]
+        out.area_px2[to], out.facing[to] = fitted.area[good], fitted.facing[good]
+    with np.errstate(invalid="ignore"):
+        out.is_outlier[:] = out.sigmas > OUTLIER_SIGMAS
+    out.n_used[:] = (np.isfinite(out.sigmas) & ~out.is_outlier).sum(axis=1)
     return out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _State:
-    """Poses of some frames, and what is added to the twist that their LEDs' motion was had from."""
-
-    R: FloatArray
-    t: FloatArray
-    twist: FloatArray
-
-    def take(self, which: IntArray) -> "_State":
-        return _State(self.R[which], self.t[which], self.twist[which])
-
-    def put(self, rows: IntArray, by: "_State", which: BoolArray | slice) -> None:
-        self.R[rows], self.t[rows], self.twist[rows] = by.R[which], by.t[which], by.twist[which]
-
-    def moved(self, step: FloatArray) -> "_State":
-        twist = self.twist + step[:, 6:] if step.shape[1] > 6 else self.twist
-        return _State(self.R @ matrix_from_rvec(step[:, :3]), self.t + step[:, 3:6], twist)
-
-
-def _descend(problem: "_Problem", state: _Evaluation, frames: IntArray, at: _State, max_steps: int) -> None:
-    """Take damped Gauss-Newton steps, in place, until each frame's step is far below its uncertainty."""
-    damping = np.full(frames.size, 1e-6)
-    live = np.isfinite(state.cost)
-    for _ in range(max_steps):
-        todo = np.flatnonzero(live)
-        if todo.size == 0:
-            break
-        A = state.A[todo]
-        damped = damping[todo, None] * np.einsum("nii->ni", A) + 1e-12
-        step = np.linalg.solve(A + damped[..., None] * np.eye(A.shape[-1]), state.g[todo][..., None])[..., 0]
-        size = np.linalg.norm(step[:, :3], axis=1)
-        step *= np.minimum(1.0, 0.5 / np.maximum(size, 1e-12))[:, None]
-        there = at.take(todo).moved(step)
-        new = problem.evaluate(frames[todo], there, state.lens.take(todo))
-        better = new.cost <= state.cost[todo] * (1 + 1e-12) + 1e-12
-        took, kept = todo[better], todo[~better]
-        at.put(took, there, better)
-        state.put(took, new, better)
-        damping[took] = np.maximum(damping[took] / 10, 1e-9)
-        damping[kept] = np.maximum(damping[kept] * 100, 1e-4)
-        small = np.einsum("ni,nij,nj->n", step, A, step) < _DONE_SIGMAS**2
-        live[todo[small & better]] = False
-        live[damping > 1e6] = False
+def _model(
+    ray_model: RayModel, brick_model: BrickModel, collar_mm: float | None, profile_is_exact: bool
+) -> Model:
+    a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
+    return Model(
+        P=np.ascontiguousarray(brick_model.led_positions_mm),
+        N=np.ascontiguousarray(brick_model.led_axes),
+        radii=np.ascontiguousarray(brick_model.led_radii_mm),
+        collar=np.nan if collar_mm is None else float(collar_mm),
+        shift_per_radius=shift_per_radius(collar_mm),
+        profile_sd=0.0 if profile_is_exact else 1.0,
+        own_sd=_OWN_SHARE,
+        plane_a=float(a),
+        apart=float(b - a),
+        huber=HUBER_SIGMAS,
+    )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
-    """What does not change while poses are fitted."""
-
-    uv_px: FloatArray
-    cov_px2: FloatArray
-    seen: BoolArray
-    ray_model: RayModel
-    brick_model: BrickModel
-    collar_mm: float | None
-    profile_is_exact: bool
-    motion: LedMotion | None
-
-    def evaluate(self, which: IntArray, at: _State, lens: LensTerms | None) -> _Evaluation:
-        """Return cost, normal equations and residuals of the frames ``which`` at their poses ``at``."""
-        R_led, t_led, E, dt, sd = at.R, at.t, None, None, None
-        if self.motion is not None:
-            dt = self.motion.dt_s[which][..., None]
-            E = matrix_from_rvec(self.motion.rvec_brick_rad[which] + at.twist[:, None, :3] * dt)
-            R_led = at.R[:, None] @ E
-            t_led = at.t[:, None] + self.motion.shift_camera_mm[which] + at.twist[:, None, 3:] * dt
-            sd = None if self.motion.twist_sd is None else self.motion.twist_sd[which]
-        prediction, J = predict_brick(
-            R_led, t_led, self.ray_model, self.brick_model, collar_mm=self.collar_mm, lens=lens
-        )
-        if E is not None and dt is not None:
-            own = J
-            # R_led = R E: a turn dtheta of the frame's brick is E^T dtheta of the LED's.
-            J = np.concatenate([own[..., :3] @ np.swapaxes(E, -1, -2), own[..., 3:]], axis=-1)
-            if sd is not None:
-                J = np.concatenate([J, own * dt[..., None]], axis=-1)
-        behind = np.asarray((t_led[..., 2] <= 0).reshape(len(which), -1).any(axis=-1), dtype=np.bool_)
-        result = _normal_equations(
-            self.uv_px[which],
-            self.cov_px2[which],
-            self.seen[which],
-            prediction,
-            J,
-            behind,
-            self.profile_is_exact,
-        )
-        if sd is not None:
-            index = np.arange(6, 12)
-            result.A[:, index, index] += 1 / sd**2
-            result.g[:, 6:] -= at.twist / sd**2
-            result.cost[:] += np.sum((at.twist / sd) ** 2, axis=1)
-        return result
-
-
-def _normal_equations(
+def _observed(
     uv: FloatArray,
     cov: FloatArray,
     seen: BoolArray,
-    prediction: LedPrediction,
-    J: FloatArray,
-    behind: BoolArray,
-    profile_is_exact: bool,
-) -> _Evaluation:
-    residual = np.where(seen[..., None], uv - prediction.uv_px, 0.0)
-    m = prediction.model_shift_px * (0.0 if profile_is_exact else 1.0)
-    m = np.where(seen[..., None], m, 0.0)
-    V = _inverse_2x2(np.where(seen[..., None, None], cov, np.eye(2)))
-    Vm = np.einsum("nlij,nlj->nli", V, m)
-    gain = 1 / (1 + np.einsum("nli,nli->nl", m, Vm))
-    W = V - gain[..., None, None] * Vm[..., :, None] * Vm[..., None, :]  # inverse of cov + m m^T
-    Wr = np.einsum("nlij,nlj->nli", W, residual)
-    sigmas = np.sqrt(np.maximum(np.einsum("nli,nli->nl", residual, Wr), 0.0))
-    weight = np.where(seen, np.minimum(1.0, HUBER_SIGMAS / np.maximum(sigmas, 1e-12)), 0.0)
-    huber = np.where(sigmas <= HUBER_SIGMAS, sigmas**2, HUBER_SIGMAS * (2 * sigmas - HUBER_SIGMAS))
-    J = np.where(seen[..., None, None], J, 0.0)
-    WJ = (weight[..., None, None] * W) @ J
+    polynomials: HitPolynomials,
+    motion: LedMotion | None,
+    rows: IntArray,
+) -> Observed:
     n, n_leds = seen.shape
-    k = J.shape[-1]
-    A = np.swapaxes(J.reshape(n, 2 * n_leds, k), 1, 2) @ WJ.reshape(n, 2 * n_leds, k)
-    g = np.einsum("nlik,nli->nk", WJ, residual)
-    shift = np.einsum("nlik,nli->nk", WJ, m)
-    cost = np.where(seen, huber, 0.0).sum(axis=1)
-    cost = np.where(behind | ~all_finite(A, 2), np.inf, cost)
-    return _Evaluation(
-        cost=cost,
-        A=A,
-        g=g,
-        shift=shift,
-        residual=np.where(seen[..., None], residual, np.nan),
-        sigmas=np.where(seen, sigmas, np.nan),
-        area=prediction.area_px2,
-        facing=prediction.facing,
-        lens=prediction.lens,
+    nothing = np.zeros((n, n_leds, 3))
+    has_twist = motion is not None and motion.twist_sd is not None
+    return Observed(
+        hits=expand_at(polynomials, np.where(seen[..., None], uv, polynomials.half_px)),
+        W=_inverse_2x2(np.where(seen[..., None, None], cov, np.eye(2))),
+        seen=seen,
+        has_motion=motion is not None,
+        rvec=nothing if motion is None else np.ascontiguousarray(motion.rvec_brick_rad[rows]),
+        shift=nothing if motion is None else np.ascontiguousarray(motion.shift_camera_mm[rows]),
+        dt=nothing[..., 0] if motion is None else np.ascontiguousarray(motion.dt_s[rows]),
+        has_twist=has_twist,
+        twist_sd=np.ones((n, 6))
+        if motion is None or motion.twist_sd is None
+        else np.ascontiguousarray(motion.twist_sd[rows]),
+    )
+
+
+def _fitted(R: FloatArray, t_mm: FloatArray, n_leds: int) -> Fitted:
+    n = len(R)
+    return Fitted(
+        R=np.array(R, order="C"),
+        t=np.array(t_mm, order="C"),
+        more=np.zeros((n, 7)),
+        covariance=np.empty((n, 6, 6)),
+        residual=np.full((n, n_leds, 2), np.nan),
+        sigmas=np.full((n, n_leds), np.nan),
+        cost=np.zeros(n),
+        area=np.full((n, n_leds), np.nan),
+        facing=np.full((n, n_leds), np.nan),
     )
 
 

@@ -79,15 +79,5 @@ def test_the_derivative_by_the_pose_meets_finite_differences(collar):
         high, _ = predict_brick(R @ turn, t + d[3:], CAMERA, brick, collar_mm=collar)
         low, _ = predict_brick(R @ turn.T, t - d[3:], CAMERA, brick, collar_mm=collar)
         numeric = (high.uv_px - low.uv_px) / (2 * step)
-        # The change of the lens terms with the pose is left out: some 0.1 %.
+        # Of the lens's curvature only the change with distance is taken along: the rest is some 0.15 %.
         np.testing.assert_allclose(J[..., k], numeric, atol=2e-3 * np.abs(J).max(axis=(0, 1, 2))[k])
-
-
-def test_lens_terms_of_a_neighbouring_pose_serve():
-    brick = seven_leds()
-    R, t = random_poses(4, seed=2)
-    at, _ = predict_brick(R, t + 0.3, CAMERA, brick, collar_mm=0.7)
-    exact, _ = predict_brick(R, t, CAMERA, brick, collar_mm=0.7)
-    near, _ = predict_brick(R, t, CAMERA, brick, collar_mm=0.7, lens=at.lens)
-    # What refine.py says of 0.5 mm.
-    np.testing.assert_allclose(near.uv_px, exact.uv_px, atol=0.004)

@@ -1,0 +1,449 @@
+"""Compiled: the least-squares fit of one frame's pose after the other; see `refine` for what it fits.
+
+Unknowns are ``[turn of the brick, rad; shift, mm]`` and, where asked for, the profile's one unknown, common
+to all LEDs, and a change of the twist that the LEDs' motion was had from, in this order.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_host.compiled import compiled
+from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view
+
+N_UNKNOWNS = 13
+_PROFILE, _TWIST = 6, 7
+_FRESH_MM, _FRESH_RAD = 0.5, 0.01  # moved less than this, an LED's shape is good to 0.001 px
+_DONE_SIGMAS = 1e-3  # a last step this small, and the next smaller still, is far below the pose's own error
+
+
+class Observed(NamedTuple):
+    """What was seen in n frames of L LEDs, and what is known of how the brick moves within them.
+
+    ``hits`` (n, L, 6, 4) are the rays near the centroids, ``W`` (n, L, 2, 2) inverse covariances, ``seen``
+    (n, L); ``rvec``, ``shift`` (n, L, 3), ``dt`` (n, L) and ``twist_sd`` (n, 6) are of `refine.LedMotion`.
+    """
+
+    hits: FloatArray
+    W: FloatArray
+    seen: BoolArray
+    has_motion: bool
+    rvec: FloatArray
+    shift: FloatArray
+    dt: FloatArray
+    has_twist: bool
+    twist_sd: FloatArray
+
+
+class Model(NamedTuple):
+    """The brick, its LEDs' profile, the planes of the rays, and where Huber's loss grows linear.
+
+    ``profile_sd`` and ``own_sd``: of what the profile leaves unknown, in units of ``shift_per_radius``, the
+    part that all LEDs have in common, and each one's own; 0: nothing.
+    """
+
+    P: FloatArray
+    N: FloatArray
+    radii: FloatArray
+    collar: float
+    shift_per_radius: float
+    profile_sd: float
+    own_sd: float
+    plane_a: float
+    apart: float
+    huber: float
+
+
+class Fitted(NamedTuple):
+    """Results, in place: poses (n, 3, 3) and (n, 3), the rest of the unknowns, and what `refine` reports."""
+
+    R: FloatArray
+    t: FloatArray
+    more: FloatArray
+    covariance: FloatArray
+    residual: FloatArray
+    sigmas: FloatArray
+    cost: FloatArray
+    area: FloatArray
+    facing: FloatArray
+
+
+@compiled
+def fit_frames(observed: Observed, model: Model, fitted: Fitted, max_steps: int) -> None:
+    """Fit all frames whose start is a number; a frame without an answer has an infinite or NaN cost."""
+    n, n_leds = observed.seen.shape
+    room = _room(n_leds)
+    for i in range(n):
+        if math.isfinite(fitted.cost[i]):
+            _fit_frame(i, observed, model, fitted, max_steps, room)
+
+
+class _Room(NamedTuple):
+    """Room to work in, for one frame."""
+
+    shapes: FloatArray
+    A: FloatArray
+    g: FloatArray
+    A_new: FloatArray
+    g_new: FloatArray
+    L: FloatArray
+    step: FloatArray
+    R: FloatArray
+    t: FloatArray
+    more: FloatArray
+    E: FloatArray
+    R_led: FloatArray
+    centre: FloatArray
+    axis: FloatArray
+    J_centre: FloatArray
+    J_axis: FloatArray
+    across: FloatArray
+    J: FloatArray
+    R_shape: FloatArray
+    t_shape: FloatArray
+
+
+@compiled
+def _room(n_leds: int) -> _Room:
+    k = N_UNKNOWNS
+    return _Room(
+        np.empty((n_leds, N_SHAPE)),
+        np.empty((k, k)),
+        np.empty(k),
+        np.empty((k, k)),
+        np.empty(k),
+        np.empty((k, k)),
+        np.empty(k),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(7),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(3),
+        np.empty((2, 3)),
+        np.empty((2, 3)),
+        np.empty(2),
+        np.empty((2, k)),
+        np.empty((3, 3)),
+        np.empty(3),
+    )
+
+
+@compiled
+def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_steps: int, room: _Room) -> None:
+    """Damped Gauss-Newton, so that no step raises the cost, until the step is far below its uncertainty.
+
+    The LEDs' shapes are those of the start; where the pose went far from it, they are had anew.
+    """
+    R, t, more = fitted.R[i], fitted.t[i], fitted.more[i]
+    n = _TWIST + 6 if observed.has_twist else _PROFILE + 1 if model.profile_sd > 0 else _PROFILE
+    cost, rejected = 0.0, False
+    for round_ in range(3):
+        room.R_shape[:], room.t_shape[:] = R, t
+        _take_shapes(i, observed, model, R, t, more, room)
+        cost = _normal_equations(i, observed, model, fitted, R, t, more, room, room.A, room.g)
+        damping = 1e-6
+        for _ in range(max_steps if round_ == 0 else 3):
+            if not math.isfinite(cost) or damping > 1e6:
+                break
+            if not _solve(room.A, room.g, damping, n, room.L, room.step):
+                break
+            size = math.sqrt(room.step[0] ** 2 + room.step[1] ** 2 + room.step[2] ** 2)
+            if size > 0.5:
+                room.step[:] *= 0.5 / size
+            room.R[:], room.t[:], room.more[:] = R, t, more
+            _move(room.R, room.t, room.more, room.step, room.E)
+            new = _normal_equations(
+                i, observed, model, fitted, room.R, room.t, room.more, room, room.A_new, room.g_new
+            )
+            if new <= cost * (1 + 1e-12) + 1e-12:
+                small = _quadratic(room.A, room.step, n) < _DONE_SIGMAS**2
+                R[:], t[:], more[:] = room.R, room.t, room.more
+                room.A[:], room.g[:] = room.A_new, room.g_new
+                cost, rejected = new, False
+                damping = max(damping / 10, 1e-9)
+                if small:
+                    break
+            else:
+                rejected = True
+                damping = max(damping * 100, 1e-4)
+        if not math.isfinite(cost) or not _went_far(R, t, room.R_shape, room.t_shape):
+            break
+    if rejected:  # residuals and the like are of the last pose tried: have those of the pose taken
+        cost = _normal_equations(i, observed, model, fitted, R, t, more, room, room.A, room.g)
+    fitted.cost[i] = cost
+    if not math.isfinite(cost) or not _solve(room.A, room.g, 0.0, n, room.L, room.step):
+        fitted.cost[i] = np.nan
+        return
+    _covariance(room.L, n, fitted.covariance[i], room.step)
+
+
+@compiled
+def _take_shapes(
+    i: int, observed: Observed, model: Model, R: FloatArray, t: FloatArray, more: FloatArray, room: _Room
+) -> None:
+    for k in range(observed.seen.shape[1]):
+        if observed.seen[i, k]:
+            _place(i, k, observed, model, R, t, more, room)
+            led_shape(
+                room.centre,
+                room.axis,
+                model.radii[k],
+                model.collar,
+                observed.hits[i, k],
+                model.plane_a,
+                model.apart,
+                room.shapes[k],
+            )
+
+
+@compiled
+def _place(
+    i: int,
+    k: int,
+    observed: Observed,
+    model: Model,
+    R: FloatArray,
+    t: FloatArray,
+    more: FloatArray,
+    room: _Room,
+) -> None:
+    """Put an LED's centre and axis, camera frame, at its own instant, into the room, with R_led and E."""
+    if observed.has_motion:
+        dt = observed.dt[i, k]
+        rotation(
+            observed.rvec[i, k, 0] + more[1] * dt,
+            observed.rvec[i, k, 1] + more[2] * dt,
+            observed.rvec[i, k, 2] + more[3] * dt,
+            room.E,
+        )
+        for r in range(3):
+            for c in range(3):
+                room.R_led[r, c] = R[r, 0] * room.E[0, c] + R[r, 1] * room.E[1, c] + R[r, 2] * room.E[2, c]
+    else:
+        dt = 0.0
+        room.R_led[:] = R
+    Rl, P, N = room.R_led, model.P, model.N
+    for r in range(3):
+        room.centre[r] = Rl[r, 0] * P[k, 0] + Rl[r, 1] * P[k, 1] + Rl[r, 2] * P[k, 2] + t[r]
+        room.axis[r] = Rl[r, 0] * N[k, 0] + Rl[r, 1] * N[k, 1] + Rl[r, 2] * N[k, 2]
+        if observed.has_motion:
+            room.centre[r] += observed.shift[i, k, r] + more[4 + r] * dt
+
+
+@compiled
+def _normal_equations(
+    i: int,
+    observed: Observed,
+    model: Model,
+    fitted: Fitted,
+    R: FloatArray,
+    t: FloatArray,
+    more: FloatArray,
+    room: _Room,
+    A: FloatArray,
+    g: FloatArray,
+) -> float:
+    """Fill in the normal matrix (lower half) and right side, and the frame's residuals; return the cost."""
+    n_leds = observed.seen.shape[1]
+    has_profile = model.profile_sd > 0
+    n = _TWIST + 6 if observed.has_twist else _PROFILE + 1 if has_profile else _PROFILE
+    A[:n, :n], g[:n] = 0.0, 0.0
+    cost = 0.0
+    J = room.J
+    J[:] = 0.0
+    for k in range(n_leds):
+        if not observed.seen[i, k]:
+            continue
+        _place(i, k, observed, model, R, t, more, room)
+        if not room.centre[2] > 0:
+            return np.inf
+        du, dv, facing, magnification = led_view(
+            room.centre,
+            room.axis,
+            observed.hits[i, k],
+            model.plane_a,
+            model.apart,
+            room.shapes[k],
+            room.J_centre,
+            room.J_axis,
+            room.across,
+        )
+        fitted.facing[i, k], fitted.area[i, k] = facing, room.shapes[k, AREA] * magnification
+        per_profile = model.shift_per_radius * model.radii[k]
+        r0 = -du - per_profile * room.across[0] * more[0]
+        r1 = -dv - per_profile * room.across[1] * more[0]
+        for row in range(2):
+            _pose_row(row, i, k, observed, model, room)
+            if has_profile:
+                J[row, _PROFILE] = per_profile * room.across[row]
+        w00, w01, w11 = observed.W[i, k, 0, 0], observed.W[i, k, 0, 1], observed.W[i, k, 1, 1]
+        if has_profile:  # this LED's own part of what the profile leaves unknown: inverse of cov + m m'
+            own = per_profile * model.own_sd
+            m0, m1 = own * room.across[0], own * room.across[1]
+            p0, p1 = w00 * m0 + w01 * m1, w01 * m0 + w11 * m1
+            gain = 1 / (1 + m0 * p0 + m1 * p1)
+            w00, w01, w11 = w00 - gain * p0 * p0, w01 - gain * p0 * p1, w11 - gain * p1 * p1
+        sigmas = math.sqrt(max(w00 * r0 * r0 + 2 * w01 * r0 * r1 + w11 * r1 * r1, 0.0))
+        fitted.residual[i, k, 0], fitted.residual[i, k, 1], fitted.sigmas[i, k] = r0, r1, sigmas
+        if sigmas <= model.huber:
+            cost += sigmas * sigmas
+        else:
+            cost += model.huber * (2 * sigmas - model.huber)
+            weight = model.huber / sigmas
+            w00, w01, w11 = w00 * weight, w01 * weight, w11 * weight
+        for c in range(n):
+            j0, j1 = w00 * J[0, c] + w01 * J[1, c], w01 * J[0, c] + w11 * J[1, c]
+            g[c] += j0 * r0 + j1 * r1
+            for b in range(c + 1):
+                A[c, b] += j0 * J[0, b] + j1 * J[1, b]
+    if has_profile:
+        per_sd = 1 / model.profile_sd**2
+        A[_PROFILE, _PROFILE] += per_sd
+        g[_PROFILE] -= more[0] * per_sd
+        cost += more[0] ** 2 * per_sd
+    elif n > _PROFILE:
+        A[_PROFILE, _PROFILE] = 1.0  # held where it is
+    if observed.has_twist:
+        for c in range(6):
+            per_sd = 1 / observed.twist_sd[i, c] ** 2
+            A[_TWIST + c, _TWIST + c] += per_sd
+            g[_TWIST + c] -= more[1 + c] * per_sd
+            cost += more[1 + c] ** 2 * per_sd
+    return cost
+
+
+@compiled
+def _pose_row(row: int, i: int, k: int, observed: Observed, model: Model, room: _Room) -> None:
+    """Fill in one row of J: by the turn and shift of the brick, and by the twist."""
+    J, Rl, P, N = room.J, room.R_led, model.P, model.N
+    c0, c1, c2 = room.J_centre[row, 0], room.J_centre[row, 1], room.J_centre[row, 2]
+    a0, a1, a2 = room.J_axis[row, 0], room.J_axis[row, 1], room.J_axis[row, 2]
+    # In brick axes; a turn theta moves the centre by R (theta x P): its row is P x (R' J).
+    x, y, z = (
+        Rl[0, 0] * c0 + Rl[1, 0] * c1 + Rl[2, 0] * c2,
+        Rl[0, 1] * c0 + Rl[1, 1] * c1 + Rl[2, 1] * c2,
+        Rl[0, 2] * c0 + Rl[1, 2] * c1 + Rl[2, 2] * c2,
+    )
+    p, q, s = (
+        Rl[0, 0] * a0 + Rl[1, 0] * a1 + Rl[2, 0] * a2,
+        Rl[0, 1] * a0 + Rl[1, 1] * a1 + Rl[2, 1] * a2,
+        Rl[0, 2] * a0 + Rl[1, 2] * a1 + Rl[2, 2] * a2,
+    )
+    t0 = P[k, 1] * z - P[k, 2] * y + N[k, 1] * s - N[k, 2] * q
+    t1 = P[k, 2] * x - P[k, 0] * z + N[k, 2] * p - N[k, 0] * s
+    t2 = P[k, 0] * y - P[k, 1] * x + N[k, 0] * q - N[k, 1] * p
+    J[row, 3], J[row, 4], J[row, 5] = c0, c1, c2
+    if observed.has_twist:
+        dt = observed.dt[i, k]
+        J[row, 7], J[row, 8], J[row, 9] = t0 * dt, t1 * dt, t2 * dt
+        J[row, 10], J[row, 11], J[row, 12] = c0 * dt, c1 * dt, c2 * dt
+    if observed.has_motion:  # R_led = R E: a turn theta of the frame's brick is E' theta of the LED's
+        E = room.E
+        J[row, 0] = E[0, 0] * t0 + E[0, 1] * t1 + E[0, 2] * t2
+        J[row, 1] = E[1, 0] * t0 + E[1, 1] * t1 + E[1, 2] * t2
+        J[row, 2] = E[2, 0] * t0 + E[2, 1] * t1 + E[2, 2] * t2
+    else:
+        J[row, 0], J[row, 1], J[row, 2] = t0, t1, t2
+
+
+@compiled
+def rotation(x: float, y: float, z: float, out: FloatArray) -> None:
+    """Put the matrix of a rotation vector into ``out`` (Rodrigues' formula)."""
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
+    if angle < 1e-4:
+        a, b = 1 - angle2 / 6, 0.5 - angle2 / 24
+    else:
+        a, b = math.sin(angle) / angle, (1 - math.cos(angle)) / angle2
+    out[0, 0], out[1, 1], out[2, 2] = (
+        1 - b * (y * y + z * z),
+        1 - b * (x * x + z * z),
+        1 - b * (x * x + y * y),
+    )
+    out[0, 1], out[1, 0] = b * x * y - a * z, b * x * y + a * z
+    out[0, 2], out[2, 0] = b * x * z + a * y, b * x * z - a * y
+    out[1, 2], out[2, 1] = b * y * z - a * x, b * y * z + a * x
+
+
+@compiled
+def _move(R: FloatArray, t: FloatArray, more: FloatArray, step: FloatArray, E: FloatArray) -> None:
+    rotation(step[0], step[1], step[2], E)
+    for r in range(3):
+        x, y, z = R[r, 0], R[r, 1], R[r, 2]
+        for c in range(3):
+            R[r, c] = x * E[0, c] + y * E[1, c] + z * E[2, c]
+        t[r] += step[3 + r]
+    for c in range(7):
+        more[c] += step[6 + c]
+
+
+@compiled
+def _went_far(R: FloatArray, t: FloatArray, R_old: FloatArray, t_old: FloatArray) -> bool:
+    moved, turned = 0.0, 0.0
+    for r in range(3):
+        moved += (t[r] - t_old[r]) ** 2
+        for c in range(3):
+            turned += (R[r, c] - R_old[r, c]) ** 2
+    return moved > _FRESH_MM**2 or turned > _FRESH_RAD**2
+
+
+@compiled
+def _solve(A: FloatArray, g: FloatArray, damping: float, n: int, L: FloatArray, x: FloatArray) -> bool:
+    """Solve (A + damping diag(A)) x = g by Cholesky, L is left; false if A is singular to precision."""
+    x[:] = 0.0
+    for c in range(n):
+        for b in range(c + 1):
+            total = A[c, b]
+            if b == c:
+                total += damping * A[c, c]
+            for k in range(b):
+                total -= L[c, k] * L[b, k]
+            if b == c:
+                if not total > 1e-14 * A[c, c]:
+                    return False
+                L[c, c] = math.sqrt(total)
+            else:
+                L[c, b] = total / L[b, b]
+    for c in range(n):
+        total = g[c]
+        for k in range(c):
+            total -= L[c, k] * x[k]
+        x[c] = total / L[c, c]
+    for c in range(n - 1, -1, -1):
+        total = x[c]
+        for k in range(c + 1, n):
+            total -= L[k, c] * x[k]
+        x[c] = total / L[c, c]
+    return True
+
+
+@compiled
+def _quadratic(A: FloatArray, x: FloatArray, n: int) -> float:
+    total = 0.0
+    for c in range(n):
+        total += A[c, c] * x[c] * x[c]
+        for b in range(c):
+            total += 2 * A[c, b] * x[c] * x[b]
+    return total
+
+
+@compiled
+def _covariance(L: FloatArray, n: int, out: FloatArray, column: FloatArray) -> None:
+    """Put the pose's block of the inverse of L L' into ``out``, shape (6, 6)."""
+    for j in range(6):
+        for c in range(n):
+            total = 1.0 if c == j else 0.0
+            for k in range(j, c):
+                total -= L[c, k] * column[k]
+            column[c] = total / L[c, c] if c >= j else 0.0
+        for c in range(n - 1, -1, -1):
+            total = column[c]
+            for k in range(c + 1, n):
+                total -= L[k, c] * column[k]
+            column[c] = total / L[c, c]
+        for c in range(6):
+            out[c, j] = column[c]
