@@ -1,5 +1,6 @@
 """A brick unit in a thread, serving run folders over the real protocol, and misbehaving when told to."""
 
+import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +14,12 @@ from bricktrack_common.wire_messages import (
     Arm,
     Armed,
     Chunk,
+    Configure,
+    Configured,
     Confirm,
     Confirmed,
+    Deleted,
+    DeleteRun,
     DescribeRun,
     Disarm,
     Disarmed,
@@ -30,6 +35,8 @@ from bricktrack_common.wire_messages import (
     RunList,
     RunSummary,
     StatusReply,
+    StillImage,
+    TakeStill,
     decode_request,
     encode_message,
 )
@@ -56,6 +63,9 @@ class FakeUnit:
         self.auto_arm = False
         self.last_error = ""
         self.health: list[HealthItem] = []
+        self.picture = b""
+        self.settings: dict[str, object] = {"camera.exposure_us": 2000, "recording.label": ""}
+        self.changed: set[str] = set()
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -128,6 +138,27 @@ class FakeUnit:
                     return Refusal(code="hash-mismatch", message="other hashes"), []
                 self.confirmed.add(run_id)
                 return Confirmed(run_id=run_id), []
+            case DeleteRun(run_id=run_id, force=force):
+                if run_id not in self.confirmed and not force:
+                    return Refusal(code="not-confirmed", message=f"no host has run {run_id}"), []
+                n_bytes = sum(f.n_bytes for f in self._files(run_id))
+                shutil.rmtree(self.runs / run_id)
+                return Deleted(run_id=run_id, n_bytes=n_bytes), []
+            case TakeStill():
+                head = StillImage(
+                    encoding="png", width_px=0, height_px=0, n_bytes=len(self.picture), model="fake",
+                    crc32=crc32(self.picture), mode="full", exposure_us=2000, analogue_gain=1.0,
+                    colour_gains=(1.0, 1.0), lit=None, taken_ns=1, simulated=True,
+                )  # fmt: skip
+                return head, [self.picture]
+            case Configure(values=values):
+                unknown = [key for key in values if key not in self.settings]
+                if unknown:
+                    return Refusal(code="bad-value", message=f"{unknown[0]}: cannot be configured"), []
+                self.changed |= {key for key, value in values.items() if value is not None}
+                self.changed -= {key for key, value in values.items() if value is None}
+                self.settings |= values
+                return Configured(values=self.settings, changed=sorted(self.changed)), []
         raise AssertionError(request)
 
     def _folders(self) -> list[Path]:

@@ -40,6 +40,7 @@ def report_answers(
     words: Callable[[T], str],
     details: Callable[[T], dict[str, object]],
     as_json: bool,
+    quiet: bool = False,
 ) -> bool:
     """Print what each unit answered, the errors last; tell whether all did as they were told.
 
@@ -51,6 +52,8 @@ def report_answers(
         An answer's line, without the unit's name.
     details : callable
         An answer for scripts.
+    quiet : bool
+        Print the errors alone.
     """
     failed = [(u, a) for u, a in zip(units, answers, strict=True) if isinstance(a, BricktrackError)]
     good = [(u, a) for u, a in zip(units, answers, strict=True) if not isinstance(a, BricktrackError)]
@@ -62,10 +65,10 @@ def report_answers(
             for u, a in zip(units, answers, strict=True)
         ]
         print_json({"ok": not failed, "units": rows})
-    elif len(units) <= _MOST_LINES:
+    elif len(units) <= _MOST_LINES and not quiet:
         for unit, answer in good:
             out.print(f"{unit.name}: {words(answer)}", markup=False, soft_wrap=True)
-    if not as_json and len(units) > 1:
+    if len(units) > 1 and not (as_json or quiet):
         out.print(f"{len(good)} of {len(units)} units {done}", markup=False)
     for unit, problem in failed:
         say_error(f"{unit.name}: {problem}")

@@ -5,7 +5,18 @@ from typing import Annotated
 
 import typer
 
-from bricktrack_host.cli import calibrate, calibrate_leds, demo, fleet, import_cmd, process, status
+from bricktrack_host.cli import (
+    calibrate,
+    calibrate_leds,
+    configure,
+    delete,
+    demo,
+    fleet,
+    import_cmd,
+    process,
+    status,
+    still,
+)
 from bricktrack_host.cli._console import out, set_up_logging
 from bricktrack_host.cli._errors import BricktrackGroup
 from bricktrack_host.cli.pull import make_pull_command
@@ -44,6 +55,9 @@ def _options(
 app.command("status")(status.status)
 app.command("arm")(fleet.arm)
 app.command("disarm")(fleet.disarm)
+app.command("still")(still.still)
+app.command("configure")(configure.configure)
+app.command("delete")(delete.delete)
 app.command("pull")(make_pull_command(process.process_pulled))
 app.command("import")(import_cmd.import_recording)
 calibrate.app.command("leds")(calibrate_leds.leds)

@@ -33,6 +33,7 @@ class Finder(Protocol):
 class Contact:
     """A connection to the unit that was meant."""
 
+    unit: UnitConfig
     client: UnitClient
     hello: HelloReply
 
@@ -91,7 +92,7 @@ class Dialer:
             hello = client.hello()
             check_name(hello, unit, address)
             opened.push(mine.pop_all())
-        return Contact(client, hello)
+        return Contact(unit, client, hello)
 
     def _find(self, unit: UnitConfig) -> str | None:
         """Ask the finder; a unit that cannot prove who it is, is followed on this machine only."""

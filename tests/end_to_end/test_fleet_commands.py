@@ -1,0 +1,193 @@
+"""The commands that set units up, over the real protocol: still, configure, delete, and many units at once."""
+
+import contextlib
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import msgpack
+import numpy as np
+import pytest
+from fake_unit import FakeUnit
+from run_folders import make_run
+from typer.testing import CliRunner
+
+from bricktrack_common.wire_messages import Arm, Refusal, encode_message
+from bricktrack_host.cli import app
+
+LAYOUT_OF_SEVEN = Path(__file__).parents[1] / "data" / "path-traced" / "layout.toml"
+
+
+@pytest.fixture
+def card(tmp_path):
+    make_run(tmp_path / "card", "fake_0001_a", {"video.h264": 1000})
+    make_run(tmp_path / "card", "fake_0002_b", {"video.h264": 1000})
+    return tmp_path / "card"
+
+
+@pytest.fixture
+def many(tmp_path):
+    """Return four units, c-1 to c-3 and d-1, and the fleet file that names them."""
+    names = ("c-1", "c-2", "c-3", "d-1")
+    with contextlib.ExitStack() as opened:
+        units = {}
+        for name in names:
+            make_run(tmp_path / name, f"{name}_0001", {"video.h264": 100_000}, unit=name)
+            units[name] = opened.enter_context(FakeUnit(tmp_path / name, name=name))
+        fleet = tmp_path / "fleet.toml"
+        fleet.write_text(
+            "".join(f'[[unit]]\nname = "{n}"\naddress = "{u.address}"\n' for n, u in units.items())
+        )
+        yield units, fleet
+
+
+def invoke(*arguments, stdin=None):
+    return CliRunner().invoke(app, [str(a) for a in arguments], input=stdin)
+
+
+def picture_of_leds(n=3):
+    luma = np.full((540, 960), 30, np.uint8)
+    for i in range(n):
+        cv2.circle(luma, (200 + 200 * i, 250), 25, 200, -1)
+    return cv2.imencode(".png", luma)[1].tobytes()
+
+
+def test_a_still_is_saved_as_it_came_and_with_its_leds_marked(card, tmp_path):
+    with FakeUnit(card) as unit:
+        unit.picture = picture_of_leds()
+        seen = invoke("still", "-a", unit.address, "-o", tmp_path / "stills")
+        told = json.loads(invoke("still", "-a", unit.address, "-o", tmp_path / "stills", "--json").stdout)
+    assert seen.exit_code == 0, seen.stderr
+    assert "3 LEDs" in seen.stdout
+    assert "to the border: left 17" in seen.stdout  # 200 - 25 px and the rim
+    assert (tmp_path / "stills" / "fake.png").read_bytes() == unit.picture
+    assert cv2.imread(str(tmp_path / "stills" / "fake_leds.png")).shape == (540, 960, 3)
+    one = told["units"][0]
+    assert (one["n_leds"], one["simulated"]) == (3, True)
+    assert [led["u_px"] for led in one["leds"]] == pytest.approx([200, 400, 600], abs=0.1)
+
+
+def test_a_still_with_an_led_less_than_the_layout_has_exits_with_1(card, tmp_path):
+    shutil.copy(LAYOUT_OF_SEVEN, tmp_path / "brick.toml")
+    with FakeUnit(card) as unit:
+        unit.picture = picture_of_leds()
+        fleet = tmp_path / "fleet.toml"
+        fleet.write_text(f'[[unit]]\nname = "fake"\naddress = "{unit.address}"\nlayout = "brick.toml"\n')
+        result = invoke("still", "-f", fleet, "-o", tmp_path / "stills")
+    assert result.exit_code == 1
+    assert "3 of 7 LEDs" in result.stdout
+    assert "the layout has 7 LEDs" in result.stderr
+
+
+def test_a_picture_that_is_none_is_an_error_and_not_a_crash(card, tmp_path):
+    with FakeUnit(card) as unit:
+        unit.picture = b"nonsense"
+        result = invoke("still", "-a", unit.address, "-o", tmp_path / "stills")
+    assert result.exit_code == 1
+    assert "expected a grey picture" in result.stderr
+
+
+def test_configure_shows_changes_and_takes_back(card):
+    with FakeUnit(card) as unit:
+        shown = invoke("configure", "-a", unit.address)
+        set_ = invoke("configure", "camera.exposure_us=1500", "recording.label=frame", "-a", unit.address)
+        assert unit.settings == {"camera.exposure_us": 1500, "recording.label": "frame"}
+        told = json.loads(invoke("configure", "-a", unit.address, "--json").stdout)
+        back = invoke("configure", "--reset", "recording.label", "-a", unit.address)
+    assert "2000" in shown.stdout
+    assert "camera.exposure_us = 1500" in set_.stdout
+    assert told["units"][0]["changed"] == ["camera.exposure_us", "recording.label"]
+    assert back.exit_code == 0
+    assert unit.changed == {"camera.exposure_us"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["camera.exposure_us"], "expected KEY=VALUE"),
+        (["a=1", "a=2"], "given twice"),
+        (["a=1", "--reset", "a"], "leave one out"),
+        (["a={x = 1}"], "is no number, word"),
+        (["camera.nonsense=1"], "cannot be configured"),
+    ],
+)
+def test_what_cannot_be_configured_is_said(card, arguments, words):
+    with FakeUnit(card) as unit:
+        result = invoke("configure", *arguments, "-a", unit.address)
+    assert result.exit_code == 1
+    assert words in result.stderr
+    assert unit.changed == set()
+
+
+def test_delete_removes_what_a_host_has_and_nothing_else(card):
+    with FakeUnit(card) as unit:
+        unit.confirmed.add("fake_0001_a")
+        result = invoke("delete", "--confirmed", "--yes", "-a", unit.address)
+    assert result.exit_code == 0
+    assert "1 of 1 runs deleted" in result.stdout
+    assert [p.name for p in card.iterdir()] == ["fake_0002_b"]
+
+
+def test_delete_of_a_run_that_no_host_has_needs_force(card):
+    with FakeUnit(card) as unit:
+        refused = invoke("delete", "*_b", "--yes", "-a", unit.address)
+        assert (card / "fake_0002_b").exists()
+        forced = invoke("delete", "*_b", "--yes", "--force", "-a", unit.address, "--json")
+    assert refused.exit_code == 1
+    assert "refused delete: no host has run fake_0002_b" in refused.stderr
+    assert forced.exit_code == 0
+    assert [d["run_id"] for d in json.loads(forced.stdout)["deleted"]] == ["fake_0002_b"]
+    assert not (card / "fake_0002_b").exists()
+
+
+def test_delete_asks_and_does_nothing_without_an_answer(card):
+    with FakeUnit(card) as unit:
+        unit.confirmed.add("fake_0001_a")
+        result = invoke("delete", "--confirmed", "-a", unit.address, stdin="")
+        nothing = invoke("delete", "-a", unit.address, "--yes")
+    assert result.exit_code == 1
+    assert "give --yes" in result.stderr
+    assert "say which runs" in nothing.stderr
+    assert (card / "fake_0001_a").exists()
+
+
+def test_arm_takes_a_pattern_and_names_who_did_not_acknowledge(many):
+    units, fleet = many
+
+    def refuses(request, messages):
+        if not isinstance(request, Arm):
+            return messages
+        request_id = msgpack.unpackb(messages[0][0])["request_id"]
+        return [[encode_message(request_id, Refusal(code="not-ready", message="no camera"))]]
+
+    units["c-2"].misbehave = refuses
+    result = invoke("arm", "--fleet", fleet, "--unit", "c-*")
+    told = json.loads(invoke("arm", "--fleet", fleet, "--unit", "c-*", "--json").stdout)
+    assert result.exit_code == 1
+    assert "2 of 3 units armed" in result.stdout
+    assert "c-2: " in result.stderr and "no camera" in result.stderr
+    assert "not armed: c-2" in result.stderr
+    assert units["d-1"].state == "idle"
+    assert [(u["name"], u["ok"]) for u in told["units"]] == [("c-1", True), ("c-2", False), ("c-3", True)]
+    assert told["units"][1]["code"] == "not-ready"
+    assert told["ok"] is False
+
+
+def test_disarm_all_is_acknowledged_by_each(many):
+    units, fleet = many
+    for unit in units.values():
+        unit.state = "armed"
+    told = json.loads(invoke("disarm", "--fleet", fleet, "--json").stdout)
+    assert told["ok"] is True
+    assert {unit.state for unit in units.values()} == {"idle"}
+
+
+def test_status_puts_units_that_need_a_hand_first_where_not_all_fit(many):
+    units, fleet = many
+    units["d-1"].state = "fault"
+    units["d-1"].last_error = "the card is full"
+    result = invoke("status", "--fleet", fleet)
+    assert result.exit_code == 1
+    assert "4 units: 3 idle, 1 fault" in result.stdout
+    assert "the card is full" in " ".join(result.stdout.split())
