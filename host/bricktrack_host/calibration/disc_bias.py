@@ -17,7 +17,9 @@ _RADII = np.sqrt(0.5 + 0.5 * np.array([-1.0, 1.0]) / np.sqrt(3.0))
 _UNIT_DISC = np.concatenate([r * np.stack([np.cos(_RING), np.sin(_RING)], axis=1) for r in _RADII])
 
 
-def disc_bias_px(model: RayModel, xy_mm: FloatArray, *, z_mm: float, diameter_mm: float) -> FloatArray:
+def disc_bias_px(
+    model: RayModel, xy_mm: FloatArray, *, z_mm: float, diameter_mm: float | FloatArray
+) -> FloatArray:
     """Return how far a disc's image centroid lies from the image of its centre.
 
     Parameters
@@ -26,7 +28,8 @@ def disc_bias_px(model: RayModel, xy_mm: FloatArray, *, z_mm: float, diameter_mm
     xy_mm : ndarray, shape (n, 2), mm, camera frame
         Centres of the discs, which lie in the plane z = ``z_mm``.
     z_mm : float, mm
-    diameter_mm : float, mm
+    diameter_mm : float or ndarray, shape (n,), mm
+        Of all discs, or of each.
 
     Returns
     -------
@@ -35,7 +38,8 @@ def disc_bias_px(model: RayModel, xy_mm: FloatArray, *, z_mm: float, diameter_mm
     """
     points = np.full((len(xy_mm), len(_UNIT_DISC) + 1, 3), z_mm)
     points[:, 0, :2] = xy_mm
-    points[:, 1:, :2] = xy_mm[:, None] + diameter_mm / 2 * _UNIT_DISC
+    radius_mm = np.broadcast_to(np.asarray(diameter_mm, dtype=np.float64) / 2, len(xy_mm))
+    points[:, 1:, :2] = xy_mm[:, None] + radius_mm[:, None, None] * _UNIT_DISC
     seen = model.project(points)
     J = seen.J_px_per_mm[:, 1:, :, :2]
     scale = np.abs(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])[..., None]
@@ -43,7 +47,14 @@ def disc_bias_px(model: RayModel, xy_mm: FloatArray, *, z_mm: float, diameter_mm
     return np.asarray(np.nan_to_num(mean - seen.uv_px[:, 0]))
 
 
-def disc_diameter_mm(model: RayModel, uv_px: FloatArray, area_px2: FloatArray, *, z_mm: float) -> float:
+def disc_diameter_mm(
+    model: RayModel,
+    uv_px: FloatArray,
+    area_px2: FloatArray,
+    *,
+    z_mm: float,
+    size: float | FloatArray = 1.0,
+) -> float:
     """Return the diameter of the dots, median over those given, from their areas in the picture.
 
     Parameters
@@ -53,8 +64,10 @@ def disc_diameter_mm(model: RayModel, uv_px: FloatArray, area_px2: FloatArray, *
     area_px2 : ndarray, shape (n,), px^2
     z_mm : float, mm
         Depth of the plane that they lie in.
+    size : float or ndarray, shape (n,), optional
+        Diameters in units of the one wanted, as `DotObservations` holds them.
     """
     xy = model.points_on_plane(uv_px, z_mm)
     J = model.project(np.concatenate([xy, np.full((len(xy), 1), z_mm)], axis=1)).J_px_per_mm[..., :2]
-    area_mm2 = area_px2 / np.abs(np.linalg.det(J))
+    area_mm2 = area_px2 / np.abs(np.linalg.det(J)) / np.square(size)
     return float(np.sqrt(4 / np.pi * np.nanmedian(area_mm2)))

@@ -16,6 +16,7 @@ from bricktrack_host.cli import (
     process,
     status,
     still,
+    target,
 )
 from bricktrack_host.cli._console import out, set_up_logging
 from bricktrack_host.cli._errors import BricktrackGroup
@@ -60,6 +61,7 @@ app.command("configure")(configure.configure)
 app.command("delete")(delete.delete)
 app.command("pull")(make_pull_command(process.process_pulled))
 app.command("import")(import_cmd.import_recording)
+app.command("target")(target.target)
 calibrate.app.command("leds")(calibrate_leds.leds)
 app.add_typer(calibrate.app, name="calibrate")
 app.command("process")(process.process)
