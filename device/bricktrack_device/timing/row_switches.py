@@ -23,6 +23,7 @@ _MIN_ROWS = 8
 _MIN_CONTRAST = 0.01  # linear light, of full scale, mean over a row's pixels
 _CLIPPED_LUMA = 232
 _LED_SHARE = 0.3
+_SETTLED_NS = 1_000_000  # how far a frame must keep from a switch to count as one that did not see it
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,18 +150,27 @@ def row_errors(
     stamps_ns, exposure_ns : ndarray of int64, shape (n_frames,), ns
     mode : SensorMode
     switchings : sequence of Switching
-        At least four frames apart.
+        In order of time. Between two of them must lie a whole frame that arrived: one that saw neither.
+
+    Notes
+    -----
+    A switch is compared with the last frame that was read out before it and the first that began to be
+    exposed after it. Frames that were lost beside it do no harm, unless they were the ones that saw it.
     """
     columns: list[tuple[NDArray[Any], ...]] = []
-    period_ns = float(np.median(np.diff(stamps_ns)))
-    for i_switch, switching in enumerate(switchings):
-        near = np.flatnonzero(np.abs(stamps_ns - switching.t_ns) < 1.6 * period_ns)
-        if near.size == 0 or near[0] < 1 or near[-1] + 1 >= len(stamps_ns):
+    delays_ns = mode.row_delay_ns(np.array([0, mode.height - 1]))
+    begins_ns = stamps_ns + np.min(delays_ns) - exposure_ns
+    ends_ns = stamps_ns + np.max(delays_ns)
+    instants = [s.t_ns for s in switchings]
+    for i_switch, (previous_ns, t_ns, next_ns) in enumerate(
+        zip([-np.inf, *instants], instants, [*instants[1:], np.inf], strict=False)
+    ):
+        since_last = (begins_ns > previous_ns + _SETTLED_NS) & (ends_ns < t_ns - _SETTLED_NS)
+        until_next = (begins_ns > t_ns + _SETTLED_NS) & (ends_ns < next_ns - _SETTLED_NS)
+        if not since_last.any() or not until_next.any():
             continue
-        before, after = near[0] - 1, near[-1] + 1
-        # A switch's neighbours must be whole frames of their own: none dropped, no other switch in them.
-        if stamps_ns[after] - stamps_ns[before] > (near.size + 1.5) * period_ns:
-            continue
+        before, after = int(np.flatnonzero(since_last)[-1]), int(np.flatnonzero(until_next)[0])
+        near = np.arange(before + 1, after)
         for i_led, window in enumerate(windows):
             delays_ns = mode.row_delay_ns(window.rows)
             change = light[i_led][after] - light[i_led][before]
@@ -170,9 +180,9 @@ def row_errors(
                 seen = np.flatnonzero((share > _SHARES[0]) & (share < _SHARES[1]))
                 if seen.size < _MIN_ROWS:
                     continue
-                t_ns = stamps_ns[j] - switching.t_ns + delays_ns[seen] - share[seen] * exposure_ns[j]
+                late_ns = stamps_ns[j] - t_ns + delays_ns[seen] - share[seen] * exposure_ns[j]
                 n = np.ones(seen.size)
-                columns.append((i_switch * n, i_led * n, window.rows[seen] * 1.0, share[seen], t_ns / 1e3))
+                columns.append((i_switch * n, i_led * n, window.rows[seen] * 1.0, share[seen], late_ns / 1e3))
     if not columns:
         empty = np.empty(0)
         return RowErrors(empty.astype(np.int64), empty.astype(np.int64), empty.astype(np.int64), empty, empty)

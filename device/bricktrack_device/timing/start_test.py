@@ -27,6 +27,9 @@ PAPER_MEAN_MS, PAPER_SD_MS = 285.7, 16.86
 _FRAMES_COUNTED = 20
 _START_S = 40.0
 _PHASES = 7
+MAX_LOST_SHARE = 0.5
+"""With more frames lost than this of a start's, its count is not believed."""
+_GRID_TOLERANCE = 0.2
 
 Progress = Callable[[float], None]
 
@@ -44,13 +47,17 @@ class Start:
     counted_ms : float
         The first of these from the count of frames in a window, as the source paper does.
     n_frames : int
-        Frames in the window; ``window_ms`` is its length.
+        Frames that the sensor made in the window; ``window_ms`` is its length.
+    n_lost : int
+        How many of them never arrived: their places are told by the stamps beside them. A frame that was
+        lost before the first one cannot be told.
     """
 
     first_frame_ms: float
     first_packet_ms: float
     counted_ms: float
     n_frames: int
+    n_lost: int
     window_ms: float
     period_ms: float
 
@@ -93,7 +100,7 @@ def start_once(rig: Rig, *, frame_period_s: float, extra_window_ms: float = 0.0)
     Raises
     ------
     HardwareError
-        If the camera does not start, or frames are missing: counting them would mislead.
+        If the camera does not start, or more frames are lost than `MAX_LOST_SHARE`.
     """
     sink = _StampSink()
     command_ns = monotonic_ns()
@@ -114,32 +121,64 @@ def start_once(rig: Rig, *, frame_period_s: float, extra_window_ms: float = 0.0)
     finally:
         camera.stop()
     return evaluate_start(
-        sink.stamps(), first_packet_us=sink.first_packet_us, command_ns=command_ns, window_ns=window_ns
+        sink.stamps(),
+        first_packet_us=sink.first_packet_us,
+        command_ns=command_ns,
+        window_ns=window_ns,
+        period_ns=section.frame_duration_us * 1000,
     )
 
 
-def evaluate_start(stamps_ns: list[int], *, first_packet_us: int, command_ns: int, window_ns: int) -> Start:
-    """Return one start's times from its frames' stamps.
+def evaluate_start(
+    stamps_ns: list[int], *, first_packet_us: int, command_ns: int, window_ns: int, period_ns: int
+) -> Start:
+    """Return one start's times from its frames' stamps; lost frames are counted by the gaps that they left.
+
+    Parameters
+    ----------
+    stamps_ns : list of int
+        In order; some of them behind the window, so that what is lost at its end is seen.
+    period_ns : int
+        Between frames, as the camera says.
 
     Raises
     ------
     HardwareError
-        If a frame is missing among those that are counted.
+        If the stamps are not on one grid of frames, or more are lost than `MAX_LOST_SHARE`.
     """
-    counted = [t for t in stamps_ns if t <= command_ns + window_ns]
-    gaps = [b - a for a, b in pairwise(counted)]
-    period_ns = median(gaps) if gaps else 0.0
-    if not gaps or max(gaps) > 1.5 * period_ns:
+    places = [0]
+    for before, after in pairwise(stamps_ns):
+        steps = (after - before) / period_ns
+        if round(steps) < 1 or abs(steps - round(steps)) > _GRID_TOLERANCE:
+            raise HardwareError(
+                f"two frames are {(after - before) / 1e6:.2f} ms apart; expected multiples of "
+                f"{period_ns / 1e6:.2f} ms. Run 'bricktrackd check'"
+            )
+        places.append(places[-1] + round(steps))
+    end_ns = command_ns + window_ns
+    n_arrived = sum(t <= end_ns for t in stamps_ns)
+    if n_arrived < 2:
+        raise HardwareError(f"{n_arrived} frames in {window_ns / 1e6:.0f} ms. Run 'bricktrackd check'")
+    span_ns = stamps_ns[-1] - stamps_ns[0]
+    period_fit_ns = span_ns / places[-1]
+    last = places[n_arrived - 1]
+    if n_arrived < len(places):  # frames that were lost between the last one and the window's end
+        inside = int((end_ns - stamps_ns[n_arrived - 1]) / period_fit_ns)
+        last = min(last + inside, places[n_arrived] - 1)
+    n_frames = last + 1
+    n_lost = n_frames - n_arrived
+    if n_lost > MAX_LOST_SHARE * n_frames:
         raise HardwareError(
-            f"{len(counted)} frames with gaps: the count of frames says nothing. Stop other programs and "
-            "repeat"
+            f"{n_lost} of {n_frames} frames were lost; at most {100 * MAX_LOST_SHARE:.0f} % may be. Stop "
+            "other programs and repeat"
         )
-    period_ms, window_ms = period_ns / 1e6, window_ns / 1e6
+    period_ms, window_ms = period_fit_ns / 1e6, window_ns / 1e6
     return Start(
-        first_frame_ms=(counted[0] - command_ns) / 1e6,
+        first_frame_ms=(stamps_ns[0] - command_ns) / 1e6,
         first_packet_ms=(first_packet_us * 1000 - command_ns) / 1e6,
-        counted_ms=initialisation_ms(window_ms, len(counted), period_ms),
-        n_frames=len(counted),
+        counted_ms=initialisation_ms(window_ms, n_frames, period_ms),
+        n_frames=n_frames,
+        n_lost=n_lost,
         window_ms=window_ms,
         period_ms=period_ms,
     )
@@ -174,7 +213,13 @@ def run_start_test(
         "start-test",
         config.unit.name,
         rig,
-        settings={"runs": n_runs, "period_ms": period_ms, "failed": problems},
+        settings={
+            "runs": n_runs,
+            "period_ms": period_ms,
+            "frames": sum(s.n_frames for s in starts),
+            "frames_lost": sum(s.n_lost for s in starts),
+            "failed": problems,
+        },
         figures={name: asdict(e) for name, e in by_method.items()},
         values={key: [c[key] for c in columns] for key in columns[0]},
     )
@@ -206,6 +251,12 @@ def print_report(result: Result, console: Console | None = None) -> None:
         )  # fmt: skip
     table.add_row("the source paper, by counting", f"{PAPER_MEAN_MS}", "", f"{PAPER_SD_MS}", "")
     console.print(table)
+    if result.settings["frames_lost"]:
+        console.print(
+            f"{result.settings['frames_lost']} of {result.settings['frames']} frames were lost; the count "
+            "takes their places from the stamps beside them",
+            style="yellow", markup=False, highlight=False,
+        )  # fmt: skip
     for words in result.settings["failed"]:
         console.print(words, style="yellow", markup=False, highlight=False)
     console.print("\nto the first frame, by its stamp:", highlight=False)

@@ -33,8 +33,16 @@ from bricktrack_device.timing.row_switches import (
 from bricktrack_device.timing.text_histogram import text_histogram
 
 DEFAULT_SWITCHES = 60
-FRAMES_BETWEEN = 6
+FRAMES_AHEAD = 5
+"""How many frames before a switch it is planned: two of them are whole frames since the last one."""
+FRAMES_TO_ARRIVE = 3
+MAX_TRIES = 3
+"""A switch whose frame was lost is made again, up to this many times what was asked for in all."""
+MIN_FOUND = 4
+"""Fewer switchings than this, or than a quarter of those asked for, are no measurement."""
 _LEARN_S = 0.7
+_LEARN_AT_MOST_S = 10.0
+_LEARN_FRAMES = 4
 _AIM_AHEAD_NS = 25_000_000
 _FIRST_FRAME_S = 15.0
 _GOLDEN = 0.6180339887498949
@@ -45,12 +53,16 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class Filmed:
-    """What the test recorded: the run's pictures, how they were taken, and when the LEDs were switched."""
+    """What the test recorded: the run's pictures, how they were taken, and when the LEDs were switched.
+
+    ``n_wanted`` is how many switchings were asked for; those whose frame was lost were made again.
+    """
 
     cut: VideoCut
     section: CameraSection
     windows: list[LedWindow]
     switchings: list[Switching]
+    n_wanted: int
 
 
 def film(config: DeviceConfig, rig: Rig, n_switches: int, progress: Progress = lambda share: None) -> Filmed:
@@ -69,7 +81,8 @@ def film(config: DeviceConfig, rig: Rig, n_switches: int, progress: Progress = l
             'pins = ["GPIO22"]'
         )
     period_s = 1 / config.camera.frame_rate_hz
-    span_s = 20 + n_switches * (FRAMES_BETWEEN + 3) * period_s
+    frames_a_switch = FRAMES_AHEAD + FRAMES_TO_ARRIVE + 2
+    span_s = 20 + 2 * _LEARN_AT_MOST_S + MAX_TRIES * n_switches * frames_a_switch * period_s
     ring = FrameRing(round(span_s * 1e9))
     camera = rig.open_camera()
     with rig.leds(config.leds.pins, active_high=config.leds.active_high) as leds:
@@ -77,17 +90,28 @@ def film(config: DeviceConfig, rig: Rig, n_switches: int, progress: Progress = l
             section = camera.start(ring)
             _check_mode(section)
             windows = _learn(ring, leds, section)
-            switchings = []
-            for k in range(n_switches):
+            switchings: list[Switching] = []
+            n_seen = 0
+            while n_seen < n_switches and len(switchings) < MAX_TRIES * n_switches:
                 # Whichever LED, wherever in its rows' exposure: the golden ratio spreads both evenly.
-                window = windows[(k // 2) % len(windows)]
-                share = 0.2 + 0.6 * (k * _GOLDEN % 1)
-                switchings.append(_switch(ring, leds, section, window, share, on=k % 2 == 0))
-                progress((k + 1) / n_switches)
+                window = windows[(n_seen // 2) % len(windows)]
+                share = 0.2 + 0.6 * (len(switchings) * _GOLDEN % 1)
+                on = len(switchings) % 2 == 0
+                switching, stamp_ns = _switch(ring, leds, section, window, share, on=on)
+                switchings.append(switching)
+                time.sleep(FRAMES_TO_ARRIVE * period_s)
+                n_seen += _has_arrived(ring, stamp_ns, section)
+                progress(n_seen / n_switches)
             time.sleep(6 * period_s)
         finally:
             camera.stop()
-    return Filmed(_cut(ring, section), section, windows, switchings)
+    return Filmed(_cut(ring, section), section, windows, switchings, n_switches)
+
+
+def _has_arrived(ring: FrameRing, stamp_ns: int, section: CameraSection) -> bool:
+    """Tell whether the frame with about this stamp came."""
+    packets, _ = ring.snapshot()
+    return any(abs(p.abs_us - stamp_ns // 1000) < section.frame_duration_us // 2 for p in packets[-30:])
 
 
 def _check_mode(section: CameraSection) -> None:
@@ -126,7 +150,11 @@ def _learn(ring: FrameRing, leds: Leds, section: CameraSection) -> list[LedWindo
     intervals = {}
     for on in (True, False):
         _, start_ns = leds.switch(on)
+        deadline = time.monotonic() + _LEARN_AT_MOST_S
         time.sleep(_LEARN_S)
+        # On a machine that loses frames it takes longer until there are enough.
+        while _n_since(ring, start_ns) < _LEARN_FRAMES and time.monotonic() < deadline:
+            time.sleep(0.05)
         intervals[on] = start_ns, monotonic_ns()
     time.sleep(5 * section.frame_duration_us * 1e-6)  # until the last ones are encoded
     sums: dict[bool, FloatArray] = {}
@@ -141,9 +169,13 @@ def _learn(ring: FrameRing, leds: Leds, section: CameraSection) -> list[LedWindo
                 counts[on] += 1
     if not counts[True] or not counts[False]:
         raise HardwareError(
-            f"{section.model}: no whole picture came in {_LEARN_S:g} s. Run 'bricktrackd check'"
+            f"{section.model}: no whole picture came in {_LEARN_AT_MOST_S:g} s. Run 'bricktrackd check'"
         )
     return find_leds(sums[True] / counts[True], sums[False] / counts[False])
+
+
+def _n_since(ring: FrameRing, start_ns: int) -> int:
+    return sum(p.abs_us * 1000 > start_ns for p in ring.snapshot()[0])
 
 
 def _from_keyframe(packets: list[EncodedPacket], at_us: int) -> list[EncodedPacket]:
@@ -154,21 +186,29 @@ def _from_keyframe(packets: list[EncodedPacket], at_us: int) -> list[EncodedPack
 
 def _switch(
     ring: FrameRing, leds: Leds, section: CameraSection, window: LedWindow, share: float, *, on: bool
-) -> Switching:
-    """Switch some frames later, while ``share`` of the exposure of the LED's middle row has passed."""
+) -> tuple[Switching, int]:
+    """Switch some frames later, while ``share`` of the exposure of the LED's middle row has passed.
+
+    Returns
+    -------
+    switching : Switching
+    stamp_ns : int
+        Which frame was aimed at.
+    """
     newest_us = ring.newest_us
     if newest_us is None:
         raise HardwareError(f"{section.model} delivers no pictures. Run 'bricktrackd check'")
     period_ns = section.frame_duration_us * 1000
     row = 0.5 * (window.v0 + window.v1 - 1)
     exposed_ns = float(section.mode.row_delay_ns(row)) - (1 - share) * section.exposure_us * 1000
-    earliest_ns = monotonic_ns() + FRAMES_BETWEEN * period_ns
+    earliest_ns = monotonic_ns() + FRAMES_AHEAD * period_ns
     n = -(-(earliest_ns - newest_us * 1000 - round(exposed_ns)) // period_ns)
-    due_ns = newest_us * 1000 + n * period_ns + round(exposed_ns)
+    stamp_ns = newest_us * 1000 + n * period_ns
+    due_ns = stamp_ns + round(exposed_ns)
     sleep_until_ns(due_ns - _AIM_AHEAD_NS)
     sleep_until_ns(due_ns)
     before_ns, after_ns = leds.switch(on)
-    return Switching(before_ns, after_ns, on)
+    return Switching(before_ns, after_ns, on), stamp_ns
 
 
 def find_in_rows(filmed: Filmed, progress: Progress = lambda share: None) -> RowErrors:
@@ -195,7 +235,7 @@ def figures_of(filmed: Filmed, errors: RowErrors) -> tuple[dict[str, float | int
     Raises
     ------
     HardwareError
-        If hardly any switching was seen.
+        If fewer were seen than `MIN_FOUND`, or than a quarter of those asked for, or of only one kind.
     """
     n = len(filmed.switchings)
     per_switch = np.full(n, np.nan)
@@ -204,12 +244,14 @@ def figures_of(filmed: Filmed, errors: RowErrors) -> tuple[dict[str, float | int
         if mine.size:
             per_switch[i] = np.median(mine)
     found = np.isfinite(per_switch)
-    if found.sum() < max(4, n // 4):
-        raise HardwareError(
-            f"only {int(found.sum())} of {n} switchings were found in the rows. Check that leds.pins light "
-            "the LEDs, and that nothing moves or flickers"
-        )
     on = np.array([s.on for s in filmed.switchings])
+    n_on, n_off = int((found & on).sum()), int((found & ~on).sum())
+    if n_on + n_off < max(MIN_FOUND, filmed.n_wanted // 4) or not n_on or not n_off:
+        raise HardwareError(
+            f"only {n_on + n_off} of {n} switchings were found in the rows, {n_on} on and {n_off} off; "
+            f"{filmed.cut.n_dropped} frames were lost. If frames are lost, stop other programs; otherwise "
+            "check that leds.pins light the LEDs, and that nothing moves or flickers"
+        )
     t_s = np.array([s.t_ns - filmed.switchings[0].t_ns for s in filmed.switchings]) * 1e-9
     # A wrong response curve moves the two kinds in opposite directions; their mean is free of it.
     mean_on, mean_off = (float(np.mean(per_switch[found & kind])) for kind in (on, ~on))
@@ -219,6 +261,7 @@ def figures_of(filmed: Filmed, errors: RowErrors) -> tuple[dict[str, float | int
     widths = [(s.after_ns - s.before_ns) / 1e3 for s in filmed.switchings]
     return {
         "switchings": n,
+        "switchings_wanted": filmed.n_wanted,
         "switchings_found": int(found.sum()),
         "rows": int(errors.error_us.size),
         "frames_dropped": filmed.cut.n_dropped,
@@ -304,8 +347,9 @@ def print_report(result: Result, console: Console | None = None) -> None:
     simulated = ", SIMULATED: this checks the software, not a camera" if result.simulated else ""
     say(f"timing-test of {result.unit}: {s['camera']}, {s['mode']}{simulated}")
     say(
-        f"{f['switchings_found']} of {f['switchings']} switchings found in {f['rows']} rows of "
-        f"{s['leds_seen']} LEDs; {f['frames_dropped']} frames dropped; exposure {s['exposure_us']} us"
+        f"{f['switchings_found']} of {f['switchings']} switchings found ({f['switchings_wanted']} asked "
+        f"for), in {f['rows']} rows of {s['leds_seen']} LEDs; {f['frames_dropped']} frames dropped; "
+        f"exposure {s['exposure_us']} us"
     )
     say(
         f"camera less GPIO: mean {f['mean_us']:+.1f} us, sd {f['sd_us']:.1f} us a switching, worst "

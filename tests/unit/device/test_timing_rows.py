@@ -7,7 +7,9 @@ from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import ConfigError, HardwareError
 from bricktrack_device.backends import open_rig
 from bricktrack_device.config import DeviceConfig
+from bricktrack_device.ring import VideoCut
 from bricktrack_device.sim.led_switch import LedSwitch, SimLeds
+from bricktrack_device.sim.settings import SimFaults, SimSettings
 from bricktrack_device.sim.sim_rig import SimRig
 from bricktrack_device.timing import timing_test
 from bricktrack_device.timing.row_switches import (
@@ -87,14 +89,32 @@ def test_a_wrong_line_time_shows_along_the_read_out() -> None:
     assert found.error_us == pytest.approx(-0.189035 * found.row, abs=0.01)
 
 
-def test_switches_without_whole_neighbours_are_left_out() -> None:
+def errors_without(lost: list[int]):
     light = rows_of(WINDOWS, SWITCHES)
-    keep = np.delete(np.arange(len(STAMPS)), 6)
-    found = row_errors(
+    keep = np.delete(np.arange(len(STAMPS)), lost)
+    return row_errors(
         [values[keep] for values in light], WINDOWS, stamps_ns=STAMPS[keep],
         exposure_ns=np.full(keep.size, EXPOSURE_NS), mode=IMX219_1080P, switchings=SWITCHES,
     )  # fmt: skip
-    assert 0 not in found.i_switch and 2 in found.i_switch
+
+
+def test_frames_lost_beside_a_switch_take_nothing_away() -> None:
+    # Switch 0 falls into frame 5: its neighbours on both sides, twice, and those of switch 1 in frame 11.
+    found = errors_without([3, 4, 6, 7, 10, 12])
+    assert set(found.i_switch.tolist()) == {0, 1, 2, 3, 4}
+    assert np.abs(found.error_us).max() < 1e-3
+
+
+def test_a_switch_whose_own_frame_was_lost_is_left_out() -> None:
+    found = errors_without([5])
+    assert set(found.i_switch.tolist()) == {1, 2, 3, 4}
+    assert np.abs(found.error_us).max() < 1e-3
+
+
+def test_a_switch_without_a_whole_frame_of_its_own_on_either_side_is_left_out() -> None:
+    # All frames between switch 0 (frame 5) and switch 1 (frame 11): neither knows its other level.
+    found = errors_without([6, 7, 8, 9, 10])
+    assert set(found.i_switch.tolist()) == {2, 3, 4}
 
 
 def test_luma_becomes_linear_by_bt709() -> None:
@@ -176,3 +196,26 @@ def test_recorded_mid_exposure_times_err_by_less_than_a_tenth_of_a_millisecond()
     assert np.nanmax(np.abs(true_us)) < 100
     # H.264 at 12 Mbit/s on the edge rows of an LED; single rows are noisier than a switch's median.
     assert np.percentile(np.abs(errors.error_us), 95) < 100
+
+
+@pytest.mark.slow
+def test_a_camera_that_loses_every_fourth_frame_is_measured_all_the_same() -> None:
+    config = DeviceConfig(backend="sim", sim=SimSettings(faults=SimFaults(drop_frame_every=4)))
+    rig = open_rig(config)
+    try:
+        result = timing_test.run_timing_test(config, rig, n_switches=8)
+    finally:
+        rig.close()
+    f = result.figures
+    # Switches whose frame was lost are made again, so that about as many are found as were asked for.
+    assert f["frames_dropped"] > 10 and f["switchings_found"] >= 5 and f["switchings"] >= 8
+    assert abs(f["mean_us"]) < 100
+
+
+def test_too_few_switchings_are_no_measurement_and_the_words_say_what_was_lost() -> None:
+    filmed = timing_test.Filmed(
+        cut=VideoCut([], [], 31, 0, []), section=None,  # type: ignore[arg-type]
+        windows=WINDOWS, switchings=SWITCHES, n_wanted=5,
+    )  # fmt: skip
+    with pytest.raises(HardwareError, match=r"only 3 of 5 switchings.* 2 on and 1 off; 31 frames were lost"):
+        timing_test.figures_of(filmed, errors_without([5 + 6, 5 + 12]))
