@@ -3,7 +3,6 @@
 import errno
 import os
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from zlib import crc32
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_device.sim.bno055_chip import Bno055Chip
+from bricktrack_device.sim.following_worker import FollowingWorker
 from bricktrack_device.sim.imu_signal import ImuSensors, chip_period_s
 from bricktrack_device.sim.settings import SimSettings
 from bricktrack_device.sim.world import Epoch, SimWorld
@@ -53,7 +53,7 @@ class SimI2c:
         self._faults = world.settings.faults
         stream = bus_stream(bus)
         sensors = ImuSensors(world, on_camera=bus in world.settings.imu.on_camera, stream=stream)
-        self._ahead = ThreadPoolExecutor(1, thread_name_prefix="sim-imu")
+        self._ahead = FollowingWorker("sim-imu")
         self.chip = Bno055Chip(
             np.random.default_rng([world.settings.seed, 10, stream]).bytes(16),
             sensors.measure,
