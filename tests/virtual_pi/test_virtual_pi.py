@@ -23,6 +23,26 @@ def test_inside(guest, name):
     assert re.search(r"\d+ passed", done.stdout), done.stdout
 
 
+@pytest.mark.skipif(not Path("/lib/systemd/systemd").exists(), reason="needs systemd, to boot it in there")
+def test_the_service_under_a_real_systemd(guest):
+    arguments = [
+        "-m",
+        "pytest",
+        "-q",
+        "-s",
+        "-p",
+        "no:cacheprovider",
+        "-c",
+        "/dev/null",
+        "--rootdir",
+        str(HERE),
+    ]
+    done = guest([*arguments, "-W", "error", str(HERE / "guest_systemd.py")], timeout_s=400)
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    assert re.search(r"\d+ passed", done.stdout), done.stdout
+    print(done.stdout)  # the journal, for whoever runs this with -s
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

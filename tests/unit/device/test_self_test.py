@@ -1,12 +1,13 @@
 """The self-test before a unit is ready: what it finds, in which words, and that nothing holds it up."""
 
 import threading
+from pathlib import Path
 
 import pytest
 from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 
 from bricktrack_common.run_manifest import CameraSection
-from bricktrack_device.config import CameraTable, DeviceConfig, ImuTable
+from bricktrack_device.config import CameraTable, DeviceConfig, ImuTable, StorageTable
 from bricktrack_device.health import self_test
 from bricktrack_device.health.self_test import run_self_test
 from bricktrack_device.health.watch import HealthWatch
@@ -92,9 +93,10 @@ def test_a_daemon_that_is_told_to_end_tries_nothing_more() -> None:
     assert rig.camera.n_stops == 0
 
 
-def test_its_findings_stay_in_the_health_of_the_status() -> None:
+def test_its_findings_stay_in_the_health_of_the_status(tmp_path: Path) -> None:
     rig = FakeRig(camera=FakeCamera(fail="no ribbon cable"))
-    watch = HealthWatch(DeviceConfig(imu=[]), rig, clock=lambda: 0.0)
+    config = DeviceConfig(imu=[], storage=StorageTable(folder=str(tmp_path)))
+    watch = HealthWatch(config, rig, clock=lambda: 0.0)
     watch.test_hardware(never)
     watch.refresh_if_due("idle")
     found = {i.name: i.level for i in watch.items}
