@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bricktrack_common.errors import ConfigError
+from bricktrack_common.key_files import read_secret_key
 from bricktrack_host.transfer.contact import Dialer
 from bricktrack_host.transfer.fleet_config import Fleet, UnitConfig, load_fleet, unit_at
 
@@ -76,4 +77,7 @@ def choose_units(
             "and give it with --fleet"
         )
     fleet = load_fleet(path)
-    return ChosenUnits(fleet.select(names), Dialer(timeout_s=timeout_s), fleet)
+    units = fleet.select(names)
+    secret = fleet.host.secret_key_path if any(u.server_key for u in units) else None
+    own_keys = None if secret is None else read_secret_key(secret)
+    return ChosenUnits(units, Dialer(timeout_s=timeout_s, own_keys=own_keys), fleet)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 from bricktrack_common.errors import BricktrackError, ConfigError, UnitTimeoutError
+from bricktrack_common.key_files import KeyPair
 from bricktrack_common.wire_messages import HelloReply
 from bricktrack_host.transfer.fleet_config import UnitConfig, check_name, is_loopback
 from bricktrack_host.transfer.unit_client import UnitClient
@@ -48,12 +49,15 @@ class Dialer:
         How long a unit may be silent.
     finder : Finder, optional
         Where to look for a unit without an address, and for one that is not at its address.
+    own_keys : KeyPair, optional
+        This host's, for units that have keys.
     stop : threading.Event, optional
         Once it is set, waiting for a unit ends with `unit_client.Stopped`.
     """
 
     timeout_s: float = 5.0
     finder: Finder | None = None
+    own_keys: KeyPair | None = None
     stop: threading.Event | None = None
 
     @contextmanager
@@ -88,7 +92,15 @@ class Dialer:
 
     def _try(self, unit: UnitConfig, address: str, opened: ExitStack) -> Contact:
         with ExitStack() as mine:
-            client = mine.enter_context(UnitClient(address, timeout_s=self.timeout_s, stop=self.stop))
+            client = mine.enter_context(
+                UnitClient(
+                    address,
+                    timeout_s=self.timeout_s,
+                    stop=self.stop,
+                    server_key=unit.server_key,
+                    own_keys=self.own_keys if unit.server_key else None,
+                )
+            )
             hello = client.hello()
             check_name(hello, unit, address)
             opened.push(mine.pop_all())

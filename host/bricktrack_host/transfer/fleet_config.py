@@ -10,12 +10,12 @@ from urllib.parse import urlsplit
 import msgspec
 
 from bricktrack_common.errors import ConfigError
+from bricktrack_common.key_files import check_public_key
 from bricktrack_common.run_manifest import RUN_ID_PATTERN
 from bricktrack_common.typed_data import load_toml
 from bricktrack_common.wire_messages import HelloReply
 
 CameraMount = Literal["static", "imu", "table"]
-_ServerKey = Annotated[str, msgspec.Meta(pattern=r"^([0-9A-Za-z.:+=^!/*?&<>()\[\]{}@%$#-]{40})?$")]  # Z85
 
 
 class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,7 +39,7 @@ class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     name: Annotated[str, msgspec.Meta(pattern=RUN_ID_PATTERN)]
     address: str = ""
-    server_key: _ServerKey = ""
+    server_key: str = ""
     calibration: str = ""
     layout: str = ""
     camera: CameraMount = "static"
@@ -133,6 +133,8 @@ def load_fleet(path: Path) -> Fleet:
                 layout=_below(base, unit.layout),
             )
         )
+        if unit.server_key:
+            check_public_key(unit.server_key, where=f"{where}.server_key")
         if unit.server_key and not fleet.host.secret_key:
             raise ConfigError(
                 f"{where}.server_key: the unit asks who we are, and {path} names no key of this host. "
