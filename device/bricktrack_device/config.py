@@ -42,10 +42,17 @@ class StorageTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class ServerTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``[server]``: where the file server listens; port 0 takes a free one and logs it."""
+    """``[server]``: where the file server listens; port 0 takes a free one and logs it.
+
+    ``keys`` is the folder of the unit's key and of those of the hosts that may speak to it; ``""`` for none:
+    then only a loopback address is served, and nothing is encrypted. With ``advertise`` a unit that can be
+    reached from the network is announced there (mDNS), where zeroconf is installed.
+    """
 
     address: str = "127.0.0.1"
     port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = DEFAULT_PORT
+    keys: str = ""
+    advertise: bool = True
 
 
 class CameraTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -169,6 +176,11 @@ class DeviceConfig(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True
         return Path(self.storage.folder).expanduser().absolute()
 
     @property
+    def keys_folder(self) -> Path | None:
+        """The folder of keys, absolute; `None` without keys."""
+        return Path(self.server.keys).expanduser().absolute() if self.server.keys else None
+
+    @property
     def calibration_folder(self) -> Path:
         """Where the calibrations of inertial sensors are kept, absolute."""
         return self.storage_folder / "calibration"
@@ -238,7 +250,7 @@ def _replaced(config: DeviceConfig, key: str, value: object, *, where: str) -> D
 
 def check_config(config: DeviceConfig, *, where: str) -> None:
     """Make sure that the values go together; see `load_config`."""
-    _check_address(config.server.address, where)
+    _check_address(config.server, where)
     names = [i.name for i in config.imu]
     if len(set(names)) < len(names):
         raise ConfigError(f"{where}: imu: a name stands twice in {names}; give each sensor its own")
@@ -253,15 +265,17 @@ def check_config(config: DeviceConfig, *, where: str) -> None:
         )
 
 
-def _check_address(address: str, where: str) -> None:
+def _check_address(server: ServerTable, where: str) -> None:
+    address = server.address
     try:
         is_loopback = ipaddress.ip_address(address).is_loopback
     except ValueError as e:
         raise ConfigError(
             f"{where}: server.address: {address!r} is no IP address; expected one such as 127.0.0.1"
         ) from e
-    if not is_loopback:
+    if not is_loopback and not server.keys:
         raise ConfigError(
             f"{where}: server.address: {address} can be reached from the network, and without keys anyone "
-            "there could arm this unit and read its runs. Use 127.0.0.1 (and an SSH tunnel to reach it)"
+            "there could arm this unit and read its runs. Make keys ('bricktrackd keys create') and set "
+            "server.keys, or use 127.0.0.1 (and an SSH tunnel to reach it)"
         )

@@ -15,6 +15,7 @@ from bricktrack_device.recovery import rebuild_manifest
 from bricktrack_device.remote_settings import RemoteSettings
 from bricktrack_device.run_store import RunStore
 from bricktrack_device.systemd_notify import notify
+from bricktrack_device.unit_keys import UnitKeys
 from bricktrack_device.unit_service import UnitService
 from bricktrack_device.watchdog import Watchdog
 
@@ -59,7 +60,9 @@ class Daemon:
             self._rig.configure(config)
             recorder = Recorder(config, self._rig, store)
             service = UnitService(settings, self._rig, recorder, store)
-            server = FileServer(self._config.server.address, self._config.server.port, service)
+            folder = self._config.keys_folder
+            keys = None if folder is None else UnitKeys(folder)
+            server = FileServer(self._config.server.address, self._config.server.port, service, keys=keys)
             for run_id in store.recover(rebuild_manifest):
                 logger.warning("%s: recovered after a cut while it was being saved", run_id)
             if threading.current_thread() is threading.main_thread():

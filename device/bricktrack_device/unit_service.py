@@ -62,6 +62,11 @@ class UnitService:
         self.health = HealthWatch(settings.config, rig)
 
     @property
+    def is_busy(self) -> bool:
+        """Whether a run is waited for, recorded or saved."""
+        return self._recorder.state in ("armed", "recording", "saving")
+
+    @property
     def _config(self) -> DeviceConfig:
         return self._settings.config
 

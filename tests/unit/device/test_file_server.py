@@ -36,6 +36,7 @@ class Handler:
 
     def __init__(self) -> None:
         self.kept: list[Answer] = []
+        self.is_busy = False
 
     def handle(self, request: Request, answer: Answer) -> None:
         if isinstance(request, Hello):
