@@ -6,6 +6,9 @@ import threading
 from pathlib import Path
 from types import FrameType
 
+from bricktrack_common.discovery import Announcement
+from bricktrack_common.key_files import fingerprint
+from bricktrack_device.advertisement import Advertisement
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.file_server import FileServer
 from bricktrack_device.health.watch import HealthWatch
@@ -71,10 +74,21 @@ class Daemon:
             service.health.refresh_if_due(recorder.state)
             notify("STATUS=trying the sensors")
             service.health.test_hardware(self._stop.is_set)
-            self._serve(recorder, server, service.health, store.folder)
+            advertisement = self._advertisement(server.port, keys)
+            try:
+                advertisement.start()
+                self._serve(recorder, server, service.health, store.folder)
+            finally:
+                advertisement.stop()
         finally:
             store.unlock()
             self._rig.close()
+
+    def _advertisement(self, port: int, keys: UnitKeys | None) -> Advertisement:
+        server = self._config.server
+        address = server.address if server.advertise else "127.0.0.1"
+        key = "" if keys is None else fingerprint(keys.own.public)
+        return Advertisement(Announcement(self._config.unit.name, key_fingerprint=key), address, port)
 
     def _serve(self, recorder: Recorder, server: FileServer, health: HealthWatch, folder: Path) -> None:
         recorder.start()
