@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.calibration.dot_detection import Dots, GreyImage, Polarity, detect_dots
 from bricktrack_host.calibration.dot_grid import GridOrigin, assign_coded_grid, assign_grid
@@ -106,6 +107,7 @@ def observe_pictures(
     *,
     origin: GridOrigin | None = None,
     polarity: Polarity | None = None,
+    mode: SensorMode | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[PlanePicture, ...]:
     """Measure pictures of a target; the first of each depth in the same axes, x to within 45 degrees of +u.
@@ -119,6 +121,8 @@ def observe_pictures(
         Of a plain target.
     polarity : "auto", "white-on-black" or "black-on-white", optional
         The target's where not given.
+    mode : SensorMode, optional
+        Pictures of another size are refused.
     progress : callable, optional
         Told how many pictures are done, of how many.
 
@@ -130,11 +134,16 @@ def observe_pictures(
     found = []
     for i, (z_mm, path) in enumerate(pictures):
         grey, sha256 = read_grey(path)
+        height, width = grey.shape
+        if mode is not None and (mode.width, mode.height) != (width, height):
+            raise CalibrationError(
+                f"{path}: {width} x {height} px; sensor mode {mode.name!r} delivers {mode.width} x "
+                f"{mode.height}. Say which mode it is with --sensor-mode"
+            )
         try:
             dots, placed = place_dots(grey, target, origin=origin, polarity=polarity)
         except CalibrationError as e:
             raise CalibrationError(f"{path}: {e}") from e
-        height, width = grey.shape
         found.append(PlanePicture(z_mm, path, sha256, (width, height), dots, placed))
         progress(i + 1, len(pictures))
     if target.coded:
@@ -161,3 +170,18 @@ def merged_planes(pictures: Sequence[PlanePicture]) -> list[tuple[float, MergedB
         except CalibrationError as e:
             raise CalibrationError(f"the pictures at {z_mm:g} mm: {e}") from e
     return merged
+
+
+def n_left_out(picture: PlanePicture, used: Sequence[tuple[float, DotObservations]]) -> int:
+    """Return how many of a picture's placed dots a fit has not used.
+
+    Parameters
+    ----------
+    picture : PlanePicture
+    used : sequence of (float, DotObservations)
+        The dots of each plane that the fit used; moved by less than half a pixel (the discs' correction).
+    """
+    kept = dict(used)[picture.z_mm]
+    same_place = np.all(kept.column_row[None] == picture.placed.column_row[:, None], axis=2)
+    near = np.hypot(*np.moveaxis(kept.uv_px[None] - picture.placed.uv_px[:, None], -1, 0)) < 0.5
+    return int(np.count_nonzero(~np.any(same_place & near, axis=1)))

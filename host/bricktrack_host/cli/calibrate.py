@@ -20,21 +20,42 @@ def _calibrate() -> None:
 @app.command()
 def fit(
     output: Annotated[Path, typer.Option("--output", "-o", help="Calibration file to write (JSON).")],
-    unit: Annotated[str, typer.Option(help="Name of the brick unit that the camera belongs to.")],
+    unit: Annotated[
+        str | None, typer.Option(help="Name of the brick unit that the camera belongs to.")
+    ] = None,
+    captured: Annotated[
+        Path | None, typer.Option(help="Folder of pictures that `calibrate capture` took.")
+    ] = None,
+    board: Annotated[Path | None, typer.Option(help="Target file, as `bricktrack target` wrote it.")] = None,
+    picture: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Depth in mm and picture of that target; two depths or more. Several of one depth are "
+            "shifted boards.",
+            metavar="Z=FILE",
+        ),
+    ] = None,
     rig: Annotated[Path | None, typer.Option(help="Rig file with a [calibration] table.")] = None,
     target: Annotated[str | None, typer.Option(help="Which target of the rig file, by name.")] = None,
     images_dir: Annotated[
         Path | None, typer.Option(help="Folder of the rig file's pictures; the rig file's own by default.")
     ] = None,
-    plane_a: Annotated[Path | None, typer.Option(help="Picture of the target at the near plane.")] = None,
+    plane_a: Annotated[
+        Path | None, typer.Option(help="Picture of an unmarked target at the near plane.")
+    ] = None,
     a_mm: Annotated[float | None, typer.Option(help="Depth of the near plane, mm.")] = None,
-    plane_b: Annotated[Path | None, typer.Option(help="Picture of the target at the far plane.")] = None,
+    plane_b: Annotated[Path | None, typer.Option(help="Picture of it at the far plane.")] = None,
     b_mm: Annotated[float | None, typer.Option(help="Depth of the far plane, mm.")] = None,
     pitch_mm: Annotated[float | None, typer.Option(help="Distance of neighbouring dots, mm.")] = None,
     columns: Annotated[int | None, typer.Option(help="Columns of the whole target.")] = None,
     rows: Annotated[int | None, typer.Option(help="Rows of the whole target.")] = None,
     origin_near: Annotated[
-        tuple[float, float] | None, typer.Option(help="A pixel near the origin.", metavar="U V")
+        tuple[float, float] | None,
+        typer.Option(
+            help="A pixel near the origin of an unmarked target; not needed where every column and row is "
+            "in view.",
+            metavar="U V",
+        ),
     ] = None,
     origin_dot: Annotated[
         bool, typer.Option(help="The origin is the dot nearest to that pixel, not the target's centre.")
@@ -57,19 +78,32 @@ def fit(
     ] = None,
     focus_note: Annotated[str, typer.Option(help="How the lens is focused, for the record.")] = "",
 ) -> None:
-    """Fit a camera's rays to pictures of a dot target at two depths.
+    """Fit a camera's rays to pictures of a dot target at two depths or more.
 
     For example:
 
-    bricktrack calibrate fit --rig rig.toml --target 32x18 --unit brick-1 -o brick-1.json
+        bricktrack calibrate fit --captured pictures-b1 -o b1.json
 
-    bricktrack calibrate fit --plane-a near.png --a-mm 101.117 --plane-b far.png --b-mm 161.111 --pitch-mm 4
-    --columns 32 --rows 18 --origin-near 960 540 --unit brick-1 -o brick-1.json
+        bricktrack calibrate fit --board target.toml --picture 101.117=near.png --picture 161.111=far.png
+        --unit b1 -o b1.json
+
+        bricktrack calibrate fit --rig rig.toml --target 32x18 --unit b1 -o b1.json
+
+        bricktrack calibrate fit --plane-a near.png --a-mm 101.117 --plane-b far.png --b-mm 161.111
+        --pitch-mm 4 --columns 32 --rows 18 --origin-near 960 540 --unit b1 -o b1.json
     """
     # With OpenCV and SciPy behind it: not for `--help`.
     from bricktrack_common.camera_model import SensorMode
     from bricktrack_host.calibration.dot_grid import GridOrigin
-    from bricktrack_host.cli._calibration_fit import FitJob, default_mode, job_of_rig, run_fit
+    from bricktrack_host.cli._calibration_fit import run_fit
+    from bricktrack_host.cli._calibration_inputs import (
+        FitJob,
+        default_mode,
+        job_of_capture,
+        job_of_pictures,
+        job_of_rig,
+        plain_target,
+    )
 
     flags = {
         "--plane-a": plane_a,
@@ -79,15 +113,29 @@ def fit(
         "--pitch-mm": pitch_mm,
         "--columns": columns,
         "--rows": rows,
-        "--origin-near": origin_near,
     }
-    if rig is not None:
-        given = [name for name, value in flags.items() if value is not None]
-        if given or origin_dot:
+    sources: dict[str, object] = {"--captured": captured, "--board": board, "--rig": rig}
+    chosen = [name for name, value in sources.items() if value is not None]
+    if len(chosen) > 1:
+        raise ConfigError(f"{' and '.join(chosen)} given together; each says it all: give one of them")
+    origin = None if origin_near is None else GridOrigin(origin_near, "dot" if origin_dot else "centre")
+    if chosen:
+        others: dict[str, object] = {**flags, "--origin-near": origin_near if chosen != ["--board"] else None}
+        if chosen != ["--board"]:
+            others["--picture"] = picture
+        given = [name for name, value in others.items() if value]
+        if given or (origin_dot and origin is None):
             raise ConfigError(
-                f"{', '.join(given or ['--origin-dot'])} given together with --rig; say it in the rig file, "
-                "or leave the rig file out"
+                f"{', '.join(given or ['--origin-dot'])} given together with {chosen[0]}; say it in that "
+                "file, or leave the file out"
             )
+    if captured is not None:
+        job = job_of_capture(captured)
+    elif board is not None:
+        if not picture:
+            raise ConfigError("--picture not given; give one for each depth, as --picture 101.117=near.png")
+        job = job_of_pictures(board, picture, origin)
+    elif rig is not None:
         job = job_of_rig(rig, target, images_dir)
     else:
         if (
@@ -98,19 +146,20 @@ def fit(
             or pitch_mm is None
             or columns is None
             or rows is None
-            or origin_near is None
         ):
             missing = [name for name, value in flags.items() if value is None]
-            raise ConfigError(f"{', '.join(missing)} not given; give them, or --rig with a rig file")
+            raise ConfigError(
+                f"{', '.join(missing)} not given; give them, or --captured, --board or --rig with a file"
+            )
         job = FitJob(
-            planes=((a_mm, plane_a), (b_mm, plane_b)),
-            columns=columns,
-            rows=rows,
-            pitch_mm=pitch_mm,
-            dot_diameter_mm=None,
-            origin=GridOrigin(origin_near, "dot" if origin_dot else "centre"),
+            pictures=((a_mm, plane_a), (b_mm, plane_b)),
+            target=plain_target(columns=columns, rows=rows, pitch_mm=pitch_mm, diameter_mm=dot_diameter_mm),
+            origin=origin,
         )
     if dot_diameter_mm is not None:
         job = msgspec.structs.replace(job, dot_diameter_mm=dot_diameter_mm)
+    name = unit or job.unit
+    if name is None:
+        raise ConfigError("--unit not given; a calibration belongs to one brick unit's camera")
     mode = load_toml(sensor_mode, SensorMode) if sensor_mode is not None else default_mode(job)
-    run_fit(job, mode=mode, model=model, order=order, unit=unit, focus_note=focus_note, output=output)
+    run_fit(job, mode=mode, model=model, order=order, unit=name, focus_note=focus_note, output=output)
