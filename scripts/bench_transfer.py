@@ -26,7 +26,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "tests" / "support"))
 
-from light_unit import idle_unit  # noqa: E402 (the tests' support is no package)
+from light_unit import LightUnit  # noqa: E402 (the tests' support is no package)
 from run_folders import make_run  # noqa: E402
 
 from bricktrack_host.transfer.run_transfer import pull_run  # noqa: E402
@@ -101,9 +101,9 @@ def measure(folder: Path, n_bytes: int, repeats: int) -> None:
     here = folder / "here"
     here.mkdir()
     times: dict[str, list[float]] = {}
-    with idle_unit(folder / "card") as address, tcp_sender(source) as port:
+    with LightUnit(folder / "card") as unit, tcp_sender(source) as port:
         ways: dict[str, Callable[[], object]] = {
-            "pull": lambda: pull_run(lambda: UnitClient(address), RUN, here),
+            "pull": lambda: pull_run(lambda: UnitClient(unit.address), RUN, here),
             "cp, synced": lambda: copy_by_cp(source, here / "cp"),
             "TCP, synced": lambda: copy_by_tcp(port, here / "tcp", sha256=False),
             "TCP, synced and hashed": lambda: copy_by_tcp(port, here / "tcp", sha256=True),

@@ -6,13 +6,11 @@ With ``--idle`` it only serves what is on its card; with ``--port N`` on this po
 """
 
 import argparse
-import contextlib
 import logging
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from device_fakes import FakeBusOpener, FakeCamera, FakeRig
@@ -71,26 +69,40 @@ class SelfDrivenRig(FakeRig):
             pin.drive_at(k % 2 == 0, t_ns * 1e-9)
 
 
-@contextlib.contextmanager
-def idle_unit(storage: Path, *, port: int = 0) -> Iterator[str]:
-    """Run such a unit, idle, in its own process; yield its address."""
-    command = [sys.executable, __file__, str(storage), "--idle", "--port", str(port)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    try:
-        yield f"tcp://127.0.0.1:{read_port(process)}"
-    finally:
-        process.kill()
-        process.communicate()
+class LightUnit:
+    """Such a unit, idle, in its own process; it can be killed and started again on the same port."""
 
+    def __init__(self, storage: Path) -> None:
+        self._storage = storage
+        self._process: subprocess.Popen[str] | None = None
+        self.port = 0
 
-def read_port(process: subprocess.Popen[str]) -> int:
-    """Return the port that a unit says it serves on; what else it logs is passed over."""
-    seen = []
-    for line in process.stderr or ():
-        seen.append(line)
-        if " port " in line:
-            return int(line.split(" port ")[1].split(";")[0])
-    raise RuntimeError("the unit ended: " + "".join(seen))
+    @property
+    def address(self) -> str:
+        return f"tcp://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        command = [sys.executable, __file__, str(self._storage), "--idle", "--port", str(self.port)]
+        self._process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        seen = []
+        for line in self._process.stderr or ():
+            seen.append(line)
+            if " port " in line:
+                self.port = int(line.split(" port ")[1].split(";")[0])
+                return
+        raise RuntimeError("the unit ended: " + "".join(seen))
+
+    def kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+
+    def __enter__(self) -> "LightUnit":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
 
 
 if __name__ == "__main__":

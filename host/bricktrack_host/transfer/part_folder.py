@@ -12,7 +12,7 @@ file, and syncs it, so that little is left to do when the last chunk is here.
 import fcntl
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -163,19 +163,17 @@ class PartFolder:
         """Bytes of the run that are still to come."""
         return sum(f.n_bytes for f in self._description.files) - self.n_bytes_verified
 
-    def missing_chunks(self, name: str, chunk_bytes: int) -> list[tuple[int, int]]:
-        """Return offset and length of the chunks of a file that are not verified, in order."""
+    def missing_chunks(self, name: str, chunk_bytes: int) -> Iterator[tuple[int, int]]:
+        """Yield offset and length of the chunks of a file that are not verified now, in order."""
         file = self._files[name]
-        chunks: list[tuple[int, int]] = []
         position = 0
         ends = sorted((r.offset, r.offset + r.n_bytes) for r in file.verified)
         for start, end in [*ends, (file.n_bytes, file.n_bytes)]:
             while position < start:
                 length = min(chunk_bytes, start - position)
-                chunks.append((position, length))
+                yield position, length
                 position += length
             position = max(position, end)
-        return chunks
 
     def write(self, name: str, offset: int, data: bytes) -> None:
         """Write a verified chunk and note it in the journal."""

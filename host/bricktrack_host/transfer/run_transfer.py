@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -31,6 +32,8 @@ from bricktrack_host.transfer.unit_client import CHUNK_BYTES, Stopped, UnitClien
 
 _RESERVED_SUFFIXES = (".part", ".partial")
 _FREE_MARGIN_BYTES = 16 * 1024 * 1024
+_MIN_CHUNK_BYTES = 16 * 1024
+_CHUNKS_AT_ONCE = 2048  # 512 MiB: however long a unit says that a file is, the list of its chunks is not
 _FIRST_BACKOFF_S = 0.25
 _MAX_BACKOFF_S = 5.0
 
@@ -101,6 +104,8 @@ def pull_run(
             now_s = time.monotonic()
             if transfer.n_bytes_fetched > n_before:
                 backoff_s, seen_s = _FIRST_BACKOFF_S, now_s
+            else:  # on a very slow network not even one chunk comes in time
+                transfer.chunk_bytes = max(transfer.chunk_bytes // 2, _MIN_CHUNK_BYTES)
             if now_s - seen_s >= patience_s:
                 raise UnitTimeoutError(f"{run_id}: {e} What came is kept; pull again to go on") from e
             transfer.progress.note(unit, f"no answer during {run_id}; trying again")
@@ -129,6 +134,7 @@ class _RunTransfer:
         self.unit = unit
         self.progress = progress
         self.n_bytes_fetched = 0
+        self.chunk_bytes = CHUNK_BYTES
         self._n_bytes_told = 0
         self._was_fetched = False  # also by an earlier call, whose confirmation did not get through
 
@@ -182,12 +188,12 @@ class _RunTransfer:
     def _fetch_file(self, client: UnitClient, part: PartFolder, index: int, file: FileSummary) -> None:
         for attempt in (1, 2):
             try:
-                for offset, data in client.read_chunks(
-                    self.run_id, index, part.missing_chunks(file.name, CHUNK_BYTES)
-                ):
-                    part.write(file.name, offset, data)
-                    self.n_bytes_fetched += len(data)
-                    self._tell(part.n_bytes_verified)
+                missing = part.missing_chunks(file.name, self.chunk_bytes)
+                while ranges := list(islice(missing, _CHUNKS_AT_ONCE)):
+                    for offset, data in client.read_chunks(self.run_id, index, ranges):
+                        part.write(file.name, offset, data)
+                        self.n_bytes_fetched += len(data)
+                        self._tell(part.n_bytes_verified)
             except TransferError as e:
                 raise TransferError(f"{self.run_id}: {file.name}: {e}") from e
             found = part.sha256(file.name)
