@@ -9,9 +9,12 @@ Run: ``python scripts/bench_fusion.py $BRICKTRACK_SAMPLES/fusion --seeds 3``
 """
 
 import argparse
+import itertools
 import logging
+import resource
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -24,7 +27,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.fusion.estimate import fuse
+from bricktrack_host.fusion.estimate import FusionInput, fuse, fuse_batch
 from bricktrack_host.fusion.time_alignment import align_times
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
@@ -249,6 +252,22 @@ def _rms(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+def time_batch(cases: list[Case], *, runs: int, workers: int) -> tuple[float, float]:
+    """Return the wall time of aligning and fusing so many runs, s, and the peak memory of a worker, MB."""
+    inputs = [
+        FusionInput(c.optical, c.imu, LEVER_ARM_MM, c.t_out_ns)
+        for c, _ in zip(itertools.cycle(cases), range(runs), strict=False)
+    ]
+    fuse_batch(inputs[:1])  # compiled code is loaded, and made on a new machine
+    started = time.perf_counter()
+    with ProcessPoolExecutor(workers) as pool:
+        results = fuse_batch(inputs, executor=pool)
+    seconds = time.perf_counter() - started
+    if len(results) != runs:
+        raise RuntimeError(f"{len(results)} results for {runs} runs")
+    return seconds, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+
+
 def main() -> None:
     """Print one table: a row a window and method, and the rms over all."""
     parser = argparse.ArgumentParser(
@@ -261,6 +280,8 @@ def main() -> None:
     parser.add_argument("--clip-g", type=float, default=16.0, help="accelerometer range")
     parser.add_argument("--frame-rate", type=float, default=30.0058, help="Hz")
     parser.add_argument("--outliers", type=float, default=0.0, help="share of frames 8 mm off")
+    parser.add_argument("--batch", type=int, default=0, help="time so many runs instead of judging")
+    parser.add_argument("--workers", type=int, default=2, help="processes that share the batch")
     args = parser.parse_args()
     logging.getLogger("bricktrack_host").setLevel(logging.ERROR)  # the hidden offset is known to be there
     recipe = Recipe(
@@ -272,6 +293,14 @@ def main() -> None:
     paths = sorted(args.folder.glob("*.npz"))
     if not paths:
         parser.error(f"no *.npz in {args.folder}")
+    if args.batch:
+        cases = [make_case(p, seed=s, recipe=recipe) for p in paths for s in range(4)]
+        seconds, megabytes = time_batch(cases, runs=args.batch, workers=args.workers)
+        print(
+            f"{args.batch} runs of 15 s aligned and fused by {args.workers} processes: {seconds:.1f} s, "
+            f"{megabytes:.0f} MB at most in each"
+        )
+        return
     table = Table(title=f"{recipe}\nreal inertial and motion-capture recordings (BROAD, CC BY 4.0)")
     for column in ("window", "seed", "method", "out mm", "in mm", "out deg", "in deg"):
         table.add_column(column, justify="left" if column in ("window", "method") else "right")

@@ -6,7 +6,9 @@ one loop over time.
 
 import logging
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -24,7 +26,7 @@ from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
 logger = logging.getLogger(__name__)
 
-_RUNS_AT_ONCE = 8  # 2000 nodes of four 21 x 21 matrices take 28 MB a run
+_RUNS_AT_ONCE = 1  # compiled loops gain nothing by more, and each run needs as many passes as it needs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,8 +165,12 @@ def fuse_batch(
     camera: Literal["static"] = "static",
     settings: FusionSettings | None = None,
     with_forward: bool = False,
+    executor: Executor | None = None,
 ) -> list[FusionResult]:
-    """Return what `fuse` gives for each of many runs, in one loop over time for eight runs at once."""
+    """Return what `fuse` gives for each of many runs, eight at once.
+
+    ``executor``: any of `concurrent.futures`, as a pool of processes; the eights are shared out to it.
+    """
     if camera != "static":
         raise ConfigError(
             f"camera = {camera!r}: expected 'static'. When the camera moves, one IMU on the LED component "
@@ -172,10 +178,10 @@ def fuse_batch(
             "Mount a second IMU with the camera, or smooth the optical poses alone (smooth_optical)."
         )
     settings = settings or FusionSettings()
-    results: list[FusionResult] = []
-    for i in range(0, len(inputs), _RUNS_AT_ONCE):
-        results += _fuse_together(inputs[i : i + _RUNS_AT_ONCE], settings, with_forward)
-    return results
+    batches = [inputs[i : i + _RUNS_AT_ONCE] for i in range(0, len(inputs), _RUNS_AT_ONCE)]
+    together = partial(_fuse_together, settings=settings, with_forward=with_forward)
+    done = map(together, batches) if executor is None else executor.map(together, batches)
+    return [result for batch in done for result in batch]
 
 
 def prepare_run(item: FusionInput) -> Run:
