@@ -2,4 +2,15 @@
 
 import os
 
+import pytest
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it once, when it is loaded
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--rig",
+        metavar="ADDRESS",
+        help="also run the tests marked 'hardware': on the hardware of this computer, given its bricktrackd.toml "
+        "(service stopped), or on a running unit elsewhere, given tcp://HOST:PORT",
+    )

@@ -1,32 +1,53 @@
-"""What any rig must do, whatever is behind it; run on the simulated one.
+"""What any rig must do, whatever is behind it: the simulated one always, a unit's own hardware where it is given.
 
-A hardware backend joins by being another parameter of the ``rig`` fixture.
+On a unit, with its service stopped and a square wave on the trigger's line::
+
+    pytest tests/contract --rig /etc/bricktrack/bricktrackd.toml
 """
 
 import time
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_device.backends import open_rig
 from bricktrack_device.bno055 import CHIP_ID, read_chip_id, set_up
-from bricktrack_device.config import DeviceConfig, ImuMode, TriggerTable
+from bricktrack_device.config import DeviceConfig, ImuMode, ImuTable, TriggerTable, load_config
 from bricktrack_device.imu_reader import ImuReader
 from bricktrack_device.interfaces import EncodedPacket, FrameMetadata, I2cBus, Rig
 from bricktrack_device.ring import JOIN_TOLERANCE_NS, FrameRing, cut_video
 from bricktrack_device.trigger import Trigger
 
-CONFIG = DeviceConfig(backend="sim")
 STREAM_S = 2.0
 
 
-@pytest.fixture(scope="module", params=["sim"])
-def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    made = open_rig(DeviceConfig(backend=request.param))
+@pytest.fixture(scope="module", params=["sim", pytest.param("hardware", marks=pytest.mark.hardware)])
+def config(request: pytest.FixtureRequest) -> DeviceConfig:
+    if request.param == "sim":
+        return DeviceConfig(backend="sim")
+    address = request.config.getoption("--rig")
+    if address is None:
+        pytest.skip("needs a unit's hardware: run it there with --rig /etc/bricktrack/bricktrackd.toml")
+    if "://" in address:
+        pytest.skip(f"{address} is another computer; these tests need the hardware of this one")
+    return load_config(Path(address), {})
+
+
+@pytest.fixture(scope="module")
+def rig(config: DeviceConfig) -> Iterator[Rig]:
+    made = open_rig(config)
     yield made
     made.close()
+
+
+@pytest.fixture(scope="module")
+def imu(config: DeviceConfig) -> ImuTable:
+    if not config.imu:
+        pytest.skip("this unit has no inertial sensor")
+    return config.imu[0]
 
 
 class Streamed:
@@ -127,57 +148,63 @@ class TestCamera:
 
 
 @pytest.fixture
-def bus(rig: Rig) -> Iterator[I2cBus]:
-    made = rig.bus_opener(CONFIG.imu[0].bus)()
+def bus(rig: Rig, imu: ImuTable) -> Iterator[I2cBus]:
+    made = rig.bus_opener(imu.bus)()
     yield made
     made.close()
 
 
+@pytest.fixture
+def address(imu: ImuTable) -> int:
+    return imu.address
+
+
 class TestI2cBus:
-    address = CONFIG.imu[0].address
+    def test_the_sensor_answers_with_its_id(self, bus: I2cBus, address: int) -> None:
+        assert read_chip_id(bus, address) == CHIP_ID
 
-    def test_the_sensor_answers_with_its_id(self, bus: I2cBus) -> None:
-        assert read_chip_id(bus, self.address) == CHIP_ID
-
-    def test_an_address_without_a_device_is_an_os_error_with_its_number(self, bus: I2cBus) -> None:
+    def test_an_address_without_a_device_is_an_os_error_with_its_number(
+        self, bus: I2cBus, address: int
+    ) -> None:
         with pytest.raises(OSError) as e:
             bus.read_burst(0x55, 0x00, 1)
         assert e.value.errno
         with pytest.raises(OSError):
             bus.writeto(0x55, b"\x07\x00")
 
-    def test_only_one_holds_the_lock(self, bus: I2cBus) -> None:
+    def test_only_one_holds_the_lock(self, bus: I2cBus, address: int) -> None:
         assert bus.try_lock() and not bus.try_lock()
         bus.unlock()
         assert bus.try_lock()
         bus.unlock()
 
-    def test_a_burst_is_as_long_as_asked_for(self, bus: I2cBus) -> None:
+    def test_a_burst_is_as_long_as_asked_for(self, bus: I2cBus, address: int) -> None:
         for n in (1, 5, 46):
-            got = bus.read_burst(self.address, 0x08, n)
+            got = bus.read_burst(address, 0x08, n)
             assert type(got) is bytes and len(got) == n
 
-    def test_buffer_ranges_of_the_drivers_calls_are_kept(self, bus: I2cBus) -> None:
+    def test_buffer_ranges_of_the_drivers_calls_are_kept(self, bus: I2cBus, address: int) -> None:
         buffer = bytearray(b"\xee\xee\xee\xee")
-        bus.writeto_then_readfrom(
-            self.address, b"\xff\x00", buffer, out_start=1, out_end=2, in_start=2, in_end=3
-        )
+        bus.writeto_then_readfrom(address, b"\xff\x00", buffer, out_start=1, out_end=2, in_start=2, in_end=3)
         assert buffer == b"\xee\xee\xa0\xee"
 
     @pytest.mark.parametrize(("mode", "acc_range_g"), [("amg", 16.0), ("accgyro", 16.0), ("ndof", 4.0)])
-    def test_set_up_by_the_real_driver_holds(self, bus: I2cBus, mode: ImuMode, acc_range_g: float) -> None:
-        facts = set_up(bus, self.address, mode)
+    def test_set_up_by_the_real_driver_holds(
+        self, bus: I2cBus, address: int, mode: ImuMode, acc_range_g: float
+    ) -> None:
+        facts = set_up(bus, address, mode)
         assert (facts.acc_range_g, facts.gyro_range_dps) == (acc_range_g, 2000.0)
         assert len(facts.chip_id) == 32 and facts.warnings == []
         time.sleep(0.05)
-        words = memoryview(bus.read_burst(self.address, 0x08, 6)).cast("h")
+        words = memoryview(bus.read_burst(address, 0x08, 6)).cast("h")
         norm_mps2 = sum((w / 100) ** 2 for w in words) ** 0.5
         # At rest on the table: gravity, within the data sheet's 1.5 m/s2 zero-g offset.
         assert abs(norm_mps2 - 9.81) < 1.5
 
-    def test_its_opener_passes_to_the_samplers_process(self, rig: Rig) -> None:
-        imu = CONFIG.imu[0]
-        reader = ImuReader(imu, rig.bus_opener(imu.bus), CONFIG.sampler, span_s=5.0)
+    def test_its_opener_passes_to_the_samplers_process(
+        self, rig: Rig, config: DeviceConfig, imu: ImuTable
+    ) -> None:
+        reader = ImuReader(imu, rig.bus_opener(imu.bus), config.sampler, span_s=5.0)
         reader.start()
         try:
             deadline = time.monotonic() + 15
@@ -194,8 +221,12 @@ class TestI2cBus:
 
 
 class TestTriggerPin:
-    def test_after_arming_edges_come_stamped_on_the_monotonic_clock(self, rig: Rig) -> None:
-        trigger = Trigger(rig.pin_factory(), TriggerTable())
+    def test_after_arming_edges_come_stamped_on_the_monotonic_clock(
+        self, rig: Rig, config: DeviceConfig
+    ) -> None:
+        # Edges count from arming on, whichever level the line has then: a laboratory's wave may run already.
+        table = TriggerTable(pin=config.trigger.pin, pull=config.trigger.pull, require_low=rig.simulated)
+        trigger = Trigger(rig.pin_factory(), table)
         try:
             t_armed = trigger.arm(lambda: None)
             rig.on_armed(t_armed)

@@ -1,10 +1,13 @@
+import re
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_device.backends import open_rig
 from bricktrack_device.config import DeviceConfig, load_config
+from bricktrack_device.sim.settings import SimFaults, SimSettings
 
 EXAMPLE = Path(__file__).parents[3] / "systemd" / "bricktrackd.toml"
 
@@ -28,6 +31,16 @@ def test_the_example_loads_and_says_the_defaults(tmp_path: Path) -> None:
     defaults = DeviceConfig(backend="sim")
     for table in ("server", "camera", "trigger", "recording", "sampler", "storage", "imu", "sim"):
         assert getattr(config, table) == getattr(defaults, table), table
+
+
+def test_the_examples_commented_simulation_is_one_that_loads(tmp_path: Path) -> None:
+    lines = EXAMPLE.read_text().split("# [sim]")[1].splitlines()
+    keys = [line.removeprefix("# ") for line in lines if re.match(r"# (\[sim|[a-z_]+ = [^ ]+)", line)]
+    sim = load_config(write(tmp_path, "\n".join(["[sim]", *keys]))).sim
+    assert (sim.dropouts, sim.faults.late_edges) == ([(4.0, 0.5)], [(12, 400.0)])
+    assert sim.hidden_leds[0].name == "m2"
+    plain = msgspec.structs.replace(sim, dropouts=[], hidden_leds=[], faults=SimFaults())
+    assert plain == SimSettings()  # what is no fault and hides nothing is the default
 
 
 @pytest.mark.parametrize(
