@@ -4,13 +4,17 @@ import base64
 import io
 import re
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 
 from bricktrack_common.arrays import FloatArray
+from bricktrack_host.reporting.chart import Chart
 from bricktrack_host.reporting.plots import FrameOverlay
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PICTURE_WIDTH_PX = 960  # more than a page shows of it
 _JPEG_QUALITY = 88
@@ -26,8 +30,13 @@ class EmbeddedFigure:
     half: bool = False
 
 
-def embed_figure(figure: Figure, alt: str, caption: str = "", *, half: bool = False) -> EmbeddedFigure:
-    """Return a figure as SVG."""
+def embed_chart(chart: Chart, alt: str, caption: str = "", *, half: bool = False) -> EmbeddedFigure:
+    """Return a chart as SVG."""
+    return EmbeddedFigure(_uri(chart.svg()), alt, caption, half)
+
+
+def embed_figure(figure: "Figure", alt: str, caption: str = "", *, half: bool = False) -> EmbeddedFigure:
+    """Return a figure of matplotlib as SVG; make and save it inside `plots.style`."""
     svg = io.StringIO()
     figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
     return EmbeddedFigure(_uri(_shortened(svg.getvalue())), alt, caption, half)

@@ -1,26 +1,23 @@
-"""The figures of a run's report, each a matplotlib `Figure` made from values; no state is shared."""
+"""The charts of a run's motion, each made from values; no state is shared."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 from scipy.signal import welch
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.reporting.figure_layout import figure_legend, panel_grid
-from bricktrack_host.reporting.figure_marks import band, dots, instants, line, spans
+from bricktrack_host.reporting.chart import INK as INK
+from bricktrack_host.reporting.chart import Chart, Panel, panel_grid
+from bricktrack_host.reporting.chart_marks import Dots, Instants, Line, Spans, band
+from bricktrack_host.reporting.thinning import thinned, thinned_band
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.run_summary import KeyFigures, main_track
 
-INK = "#22272e"
 FUSED = "#1f5f8b"
 OPTICAL = "#c8651b"
 TRUTH = "#2f7d4f"
@@ -58,7 +55,7 @@ STYLE: Any = {
     "svg.hashsalt": "bricktrack",
     "path.simplify_threshold": 0.2,
 }
-"""For `matplotlib.rc_context` around making *and* saving the figures."""
+"""For `matplotlib.rc_context` around making *and* saving matplotlib's figures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,62 +118,73 @@ class TimeAxis:
 
 
 def style() -> Any:
-    """Return the context in which figures are made and saved."""
+    """Return the context in which matplotlib's figures are made and saved."""
+    import matplotlib as mpl  # takes half a second, and the charts of a run do without it
+
     return mpl.rc_context(STYLE)
 
 
-def motion_figure(
+def line(x: FloatArray, y: FloatArray, *, colour: str, width_pt: float = 1.0, label: str = "") -> Line:
+    """Return a line through samples, no more of them than a page can show."""
+    index = thinned(x, y)
+    return Line(x[index], y[index], colour, width_pt, label)
+
+
+def motion_chart(
     result: RunResult, figures: KeyFigures, *, span_s: tuple[float, float] | None = None
-) -> Figure:
+) -> Chart:
     """Return six time histories: from rest where there is a rest pose, else in the camera frame.
 
     ``span_s`` limits the time axis, for a close-up.
     """
     axis = TimeAxis.of(result)
     if span_s is None:
-        fig, axes = panel_grid(6, height_in=9.6, legend=True)
+        chart = panel_grid(6, height_in=9.6, legend=True)
+        panels = [row[0] for row in chart.panels]
     else:
-        fig, axes = panel_grid(3, 2, height_in=6.0, legend=True)
-    panels = axes[:, 0] if span_s is None else axes.T.reshape(-1)
+        chart = panel_grid(3, 2, height_in=6.0, legend=True)
+        panels = [row[k] for k in range(2) for row in chart.panels]
     track = main_track(result)
     optical = result.optical
     optical_s = axis.s(optical.t_ns)
     optical_y, optical_sd = _six(
         result, optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance
     )
-    chosen = slice(None) if span_s is None else (optical_s >= span_s[0]) & (optical_s <= span_s[1])
-    inside: Any = slice(None)
+    chosen = np.ones(len(optical_s), dtype=bool)
+    if span_s is not None:
+        chosen = (optical_s >= span_s[0]) & (optical_s <= span_s[1])
     if track is not None:
         fused_s = axis.s(track.t_ns)
         inside = track.flags & int(PoseFlag.EXTRAPOLATED) == 0
         if span_s is not None:
             inside &= (fused_s >= span_s[0]) & (fused_s <= span_s[1])
         fused_y, fused_sd = _six(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
+        fused_s, fused_y, fused_sd = fused_s[inside], fused_y[inside], fused_sd[inside]
     d = "d" if result.rest is not None else ""
     names = [f"{d}x, mm", f"{d}y, mm", f"{d}z, mm", f"{d}rot x, deg", f"{d}rot y, deg", f"{d}rot z, deg"]
-    for i, ax in enumerate(panels):
-        mark_events(ax, axis, result, figures)
+    for i, panel in enumerate(panels):
+        mark_events(panel, axis, result, figures)
         if track is not None:
-            y, half = fused_y[inside, i], 1.96 * fused_sd[inside, i]
-            band(ax, fused_s[inside], y - half, y + half, color=FUSED, alpha=0.22, label="95 % band")
-            line(ax, fused_s[inside], y, color=FUSED, lw=0.9, label="fused")
+            y, half = fused_y[:, i], 1.96 * fused_sd[:, i]
+            promised = thinned_band(fused_s, y - half, y + half)
+            panel.add(
+                band(*promised, colour=FUSED, opacity=0.22, label="95 % band"),
+                line(fused_s, y, colour=FUSED, width_pt=0.9, label="fused"),
+            )
+        seen_s, seen = optical_s[chosen], optical_y[chosen, i]
         if span_s is None:
-            dots(ax, optical_s, optical_y[:, i], size_pt=1.9, color=OPTICAL, label="optical")
+            panel.add(Dots(seen_s, seen, OPTICAL, 1.9, label="optical"))
         else:
-            ax.errorbar(
-                optical_s[chosen], optical_y[chosen, i], 1.96 * optical_sd[chosen, i], fmt="o", color=OPTICAL,
-                ms=3, mew=0, elinewidth=0.8, label="optical, 95 %",
-            )  # fmt: skip
-        ax.set_ylabel(names[i])
-        if span_s is not None:
-            ax.set_xlim(*span_s)
-    figure_legend(fig, panels)
-    for ax in axes[-1]:
-        ax.set_xlabel(axis.label)
-    return fig
+            half = 1.96 * optical_sd[chosen, i]
+            panel.add(Dots(seen_s, seen, OPTICAL, 3.0, half=half, label="optical, 95 %"))
+        panel.y_label = names[i]
+        panel.x_limits = span_s
+    for panel in chart.panels[-1]:
+        panel.x_label = axis.label
+    return chart
 
 
-def spectrum_figure(result: RunResult) -> Figure | None:
+def spectrum_chart(result: RunResult) -> Chart | None:
     """Return amplitude spectra of the motion at inertial slots; `None` where it is too short."""
     track = main_track(result)
     if track is None:
@@ -191,25 +199,19 @@ def spectrum_figure(result: RunResult) -> Figure | None:
     values, _ = _six(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
     camera = result.manifest.camera
     nyquist_hz = 0.5e6 / camera.frame_duration_us if camera and camera.frame_duration_us > 0 else None
-    fig, ((*axes,),) = panel_grid(1, 2, height_in=2.9, titles=True, share_x=False)
+    chart = panel_grid(1, 2, height_in=2.9, titles=True, share_x="none")
+    (panels,) = chart.panels
+    for panel, title, unit in zip(panels, ("Displacement", "Rotation"), ("mm", "deg"), strict=True):
+        panel.title, panel.y_label, panel.x_label = title, f"{unit} / sqrt(Hz)", "frequency, Hz"
+        panel.x_limits, panel.log_y, panel.legend = (0.0, 0.5 / step_s), True, True
     for i in range(6):
         y = np.interp(even_s, t_s, values[inside, i])
-        n = min(len(y), 512)
-        f_hz, power = welch(y, 1 / step_s, nperseg=n, detrend="constant")
-        ax = axes[i // 3]
-        ax.semilogy(f_hz[1:], np.sqrt(power[1:]), color=LED_COLOURS[i % 3], label="xyz"[i % 3])
-    axes[0].set_title("Displacement")
-    axes[0].set_ylabel("mm / sqrt(Hz)")
-    axes[1].set_title("Rotation")
-    axes[1].set_ylabel("deg / sqrt(Hz)")
-    for ax in axes:
-        ax.set_xlabel("frequency, Hz")
-        ax.set_xlim(0, 0.5 / step_s)
-        ax.yaxis.set_minor_formatter(NullFormatter())
-        if nyquist_hz is not None:
-            ax.axvline(nyquist_hz, color=INK, lw=0.7, ls=":")
-        ax.legend(loc="upper right")
-    return fig
+        f_hz, power = welch(y, 1 / step_s, nperseg=min(len(y), 512), detrend="constant")
+        panels[i // 3].add(Line(f_hz[1:], np.sqrt(power[1:]), LED_COLOURS[i % 3], label="xyz"[i % 3]))
+    if nyquist_hz is not None:
+        for panel in panels:
+            panel.add(Instants(np.array([nyquist_hz]), INK, 0.7, dashes_pt=(0.8, 1.4)))
+    return chart
 
 
 def _six(
@@ -232,9 +234,12 @@ def _six(
     )
 
 
-def mark_events(ax: Axes, axis: TimeAxis, result: RunResult, figures: KeyFigures) -> None:
+def mark_events(panel: Panel, axis: TimeAxis, result: RunResult, figures: KeyFigures) -> None:
     """Shade the dropouts, and mark trigger and impacts."""
-    spans(ax, axis.s(figures.dropouts_ns), color=SHADE, label="no optical pose used")
-    instants(ax, axis.s(figures.impacts_ns), color=IMPACT, lw=0.8, alpha=0.75, label="impact")
+    if len(figures.dropouts_ns):
+        panel.add(Spans(axis.s(figures.dropouts_ns), SHADE, label="no optical pose used"))
+    if len(figures.impacts_ns):
+        panel.add(Instants(axis.s(figures.impacts_ns), IMPACT, opacity=0.75, label="impact"))
     if result.t0_ns is not None:
-        ax.axvline((result.t0_ns - axis.origin_ns) / 1e9, color=INK, lw=0.7, ls=(0, (4, 3)), label="trigger")
+        at_s = axis.s(np.array([result.t0_ns]))
+        panel.add(Instants(at_s, INK, 0.7, dashes_pt=(2.8, 2.1), label="trigger"))

@@ -14,7 +14,6 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import StorageError
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.reporting.plots import style
 from bricktrack_host.reporting.report_sections import ReportExtras, in_words, report_sections, value_text
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.run_summary import KeyFigures, key_figures, main_track, verdict
@@ -54,8 +53,7 @@ def render_report(result: RunResult, extras: ReportExtras | None = None) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    with style():
-        sections = report_sections(result, figures, extras)
+    sections = report_sections(result, figures, extras)
     return environment.get_template("report.html.j2").render(
         run_id=result.manifest.run_id,
         unit=result.manifest.unit,

@@ -7,13 +7,13 @@ import numpy as np
 
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting import quality_plots
-from bricktrack_host.reporting.embedding import EmbeddedFigure, embed_figure, embed_overlay
+from bricktrack_host.reporting.embedding import EmbeddedFigure, embed_chart, embed_overlay
 from bricktrack_host.reporting.plots import (
     CalibrationPicture,
     FrameOverlay,
     TimeAxis,
-    motion_figure,
-    spectrum_figure,
+    motion_chart,
+    spectrum_chart,
 )
 from bricktrack_host.results.result_store import DetailValue, RunResult
 from bricktrack_host.results.run_summary import KeyFigures, main_track
@@ -60,7 +60,7 @@ class Section:
 
 
 def report_sections(result: RunResult, figures: KeyFigures, extras: ReportExtras) -> list[Section]:
-    """Return what there is to show of a run, in order; call it inside `plots.style`."""
+    """Return what there is to show of a run, in order."""
     sections = []
     if figures.n_poses:
         sections.append(_motion_section(result, figures))
@@ -72,8 +72,8 @@ def report_sections(result: RunResult, figures: KeyFigures, extras: ReportExtras
         words = "Rings: where an LED was seen. Crosses: where the pose puts it."
         shown = [embed_overlay(o) for o in extras.overlays]
         sections.append(Section("pictures", "LEDs in the pictures", [words], shown, overlays=True))
-    timing = embed_figure(
-        quality_plots.timing_figure(result, figures),
+    timing = embed_chart(
+        quality_plots.timing_chart(result, figures),
         "Frame intervals, lateness of inertial slots, residuals of the square wave's edges",
     )
     sections.append(Section("timing", "Timing", _timing_words(result, figures), [timing]))
@@ -83,12 +83,12 @@ def report_sections(result: RunResult, figures: KeyFigures, extras: ReportExtras
         rows = [[in_words(name), value_text(value)] for name, value in result.calibration.items()]
         calibration.tables.append(SectionTable("", ["", ""], rows, 2))
     if extras.calibration is not None:
-        picture = quality_plots.calibration_figure(extras.calibration, result.observations.uv_px)
+        picture = quality_plots.calibration_chart(extras.calibration, result.observations.uv_px)
         caption = (
             "Rays outside the covered region are extrapolated; poses that use one are flagged uncovered."
         )
         calibration.figures.append(
-            embed_figure(picture, "Region covered by calibration dots", caption, half=True)
+            embed_chart(picture, "Region covered by calibration dots", caption, half=True)
         )
     if calibration.tables or calibration.figures:
         sections.append(calibration)
@@ -105,21 +105,21 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
         )
     else:
         words = "No rest pose: position of the first LED and rotation vector in the camera frame."
-    whole = embed_figure(
-        motion_figure(result, figures), "Time histories of three displacements and three rotations",
+    whole = embed_chart(
+        motion_chart(result, figures), "Time histories of three displacements and three rotations",
         "Line: fused motion, 95 % band. Dots: optical poses. Shaded: no optical pose used. Red: impacts.",
     )  # fmt: skip
     section = Section("motion", "Motion", [words], [whole])
     span = _closeup(result, figures)
     if span is not None:
         section.figures.append(
-            embed_figure(motion_figure(result, figures, span_s=span), "Close-up of the time histories",
+            embed_chart(motion_chart(result, figures, span_s=span), "Close-up of the time histories",
                    "Close-up around the highest speed. Bars: 95 % of each optical pose.")
         )  # fmt: skip
-    spectrum = spectrum_figure(result)
+    spectrum = spectrum_chart(result)
     if spectrum is not None:
         section.figures.append(
-            embed_figure(
+            embed_chart(
                 spectrum,
                 "Spectra of displacement and rotation",
                 "Amplitude density of the fused motion. Dotted: half the frame rate.",
@@ -158,9 +158,9 @@ def _residual_section(result: RunResult) -> Section:
     head = ["LED", "frames used", "mean u, px", "mean v, px", "rms u, px", "rms v, px", "largest, px"]
     section.tables.append(SectionTable("", head, rows, 1))
     section.figures = [
-        embed_figure(quality_plots.residual_time_figure(result), "Residuals of each LED over time",
+        embed_chart(quality_plots.residual_time_chart(result), "Residuals of each LED over time",
                      "Crosses at the border: beyond the axis."),
-        embed_figure(quality_plots.residual_picture_figure(result),
+        embed_chart(quality_plots.residual_picture_chart(result),
                      "LEDs in the picture with their mean residuals",
                      "Where the LEDs were in the picture; arrows: mean residual of each, enlarged.",
                      half=True),
@@ -192,7 +192,7 @@ def _timing_words(result: RunResult, figures: KeyFigures) -> list[str]:
 def _alignment_section(result: RunResult) -> list[Section]:
     offset_ms = result.alignment.get("imu_minus_camera_ms", result.alignment.get("offset_ms", 0.0))
     offset_ns = round(float(offset_ms) * 1e6) if isinstance(offset_ms, (int, float)) else 0
-    figure = quality_plots.alignment_figure(result, imu_minus_camera_ns=offset_ns)
+    figure = quality_plots.alignment_chart(result, imu_minus_camera_ns=offset_ns)
     if figure is None and not result.alignment:
         return []
     section = Section("alignment", "Camera and inertial sensor")
@@ -200,7 +200,7 @@ def _alignment_section(result: RunResult) -> list[Section]:
         rows = [[in_words(name), value_text(value)] for name, value in result.alignment.items()]
         section.tables.append(SectionTable("", ["", ""], rows, 2))
     if figure is not None:
-        section.figures.append(embed_figure(
+        section.figures.append(embed_chart(
             figure, "Angular rates of gyroscope and optics",
             "Above: the second in which the brick turns fastest. Below: the gyroscope's mean between two "
             "frames, less bias, less the optical rate; what follows the motion there is a time offset.",
@@ -236,7 +236,7 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
             )
         )
     section.figures.append(
-        embed_figure(quality_plots.truth_figure(result, figures, truth), "Errors against the truth over time",
+        embed_chart(quality_plots.truth_chart(result, figures, truth), "Errors against the truth over time",
                "Band: what the fused covariances promise, 95 %. The tables hold errors beyond the axes.")
     )  # fmt: skip
     return section
