@@ -34,9 +34,11 @@ class KeyPair:
 
 
 def make_key_pair() -> KeyPair:
-    """Return a new pair."""
-    public, secret = zmq.curve_keypair()
-    return KeyPair(public.decode("ascii"), secret.decode("ascii"))
+    """Return a new pair, whose public key can be typed as an argument: it does not begin with a hyphen."""
+    while True:
+        public, secret = zmq.curve_keypair()
+        if not public.startswith(b"-"):
+            return KeyPair(public.decode("ascii"), secret.decode("ascii"))
 
 
 def check_public_key(text: str, *, where: str) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bricktrack_common.errors import BricktrackError
+from bricktrack_device import keys_cli
 
 # Imports stay inside the commands: each sampler's process imports this module again, and must stay small.
 if TYPE_CHECKING:
@@ -70,6 +71,9 @@ _START_TEST_EPILOG = """Examples:
 
   bricktrackd start-test --backend sim --runs 5
 """
+
+
+app.add_typer(keys_cli.app)
 
 
 @app.command(epilog=_RUN_EPILOG)
