@@ -330,10 +330,14 @@ class UnitClient:
         return reply
 
     def _send(self, request: Request, deadline_s: float) -> int:
-        self._wait_for(zmq.POLLOUT, deadline_s, "no connection")
         request_id = next(self._request_ids)
-        self._socket.send(encode_message(request_id, request), zmq.NOBLOCK)
-        return request_id
+        while True:
+            self._wait_for(zmq.POLLOUT, deadline_s, "no connection")
+            try:
+                self._socket.send(encode_message(request_id, request), zmq.NOBLOCK)
+            except zmq.Again:
+                continue  # the connection broke between the two
+            return request_id
 
     def _receive(self, deadline_s: float, waiting_for: str) -> tuple[int, Reply, bytes]:
         """Return the next message of this protocol: its number, its body and the bytes behind it."""
