@@ -5,7 +5,6 @@ processed again gives the same bytes.
 """
 
 import importlib.metadata
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,10 +16,10 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from bricktrack_common.arrays import IntArray
-from bricktrack_common.errors import RunFormatError, StorageError
+from bricktrack_common.errors import RunFormatError
 from bricktrack_common.run_manifest import RunManifest
 from bricktrack_common.typed_data import dump_json, load_json
-from bricktrack_host.durable_files import sync_file, sync_folder
+from bricktrack_host.durable_files import write_folder_whole
 from bricktrack_host.results.daq_clock import EdgeFit, fit_edges
 from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.results.result_tables import (
@@ -156,8 +155,7 @@ def software_version() -> str:
 def write_results(result: RunResult, folder: Path) -> None:
     """Write a run's results, replacing a folder of an earlier processing.
 
-    Everything is written beside the folder first, synced, and then renamed: a kill at any moment leaves
-    the old results, or none, or the new ones, never a part.
+    The folder is written whole or not at all; see `write_folder_whole`.
 
     Parameters
     ----------
@@ -170,27 +168,7 @@ def write_results(result: RunResult, folder: Path) -> None:
     StorageError
         If the folder exists and holds something else than results, or cannot be written.
     """
-    partial = folder.with_name(f".{folder.name}.partial")
-    previous = folder.with_name(f".{folder.name}.previous")
-    if folder.exists() and not (folder / SUMMARY_NAME).is_file():
-        raise StorageError(f"{folder} exists and holds no bricktrack results; it is left alone. Move it away")
-    try:
-        for leftover in (partial, previous):
-            if leftover.exists():
-                shutil.rmtree(leftover)
-        partial.mkdir(parents=True)
-        _write_files(result, partial)
-        for path in sorted(partial.iterdir()):
-            sync_file(path)
-        sync_folder(partial)
-        if folder.exists():
-            folder.rename(previous)
-        partial.rename(folder)
-        sync_folder(folder.parent)
-        if previous.exists():
-            shutil.rmtree(previous)
-    except OSError as e:
-        raise StorageError(f"{folder}: results cannot be written: {e.strerror or e}") from e
+    write_folder_whole(folder, lambda partial: _write_files(result, partial), marker=SUMMARY_NAME)
 
 
 def _write_files(result: RunResult, folder: Path) -> None:

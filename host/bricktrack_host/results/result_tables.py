@@ -52,7 +52,7 @@ class Column:
     meaning: str
 
 
-_Columns = list[tuple[Column, "pa.Array[Any]"]]
+Columns = list[tuple[Column, "pa.Array[Any]"]]
 
 
 def pose_flag_words(flags: IntArray) -> list[str]:
@@ -89,7 +89,7 @@ def optical_table(
     n_used = np.isfinite(optical.residual_px).all(axis=2).sum(axis=1).astype(np.int64)
     squares = np.nansum(optical.residual_px**2, axis=(1, 2))
     rms_px = np.sqrt(np.divide(squares, n_used, out=np.full(len(n_used), np.nan), where=n_used > 0))
-    columns: _Columns = [
+    columns: Columns = [
         (Column("frame", "1", "number of the frame record in the run"),
          pa.array(np.arange(len(optical.t_ns)))),
         *_time_columns(optical.t_ns, t0_ns, edge_fit),
@@ -100,11 +100,11 @@ def optical_table(
         (Column("sensor_timestamp_ns", "ns", "start of read-out of the first row"),
          pa.array(observations.sensor_timestamp_ns)),
         (Column("exposure_ns", "ns", "exposure time"), pa.array(observations.exposure_ns)),
-        *_flag_columns(optical.flags),
+        *flag_columns(optical.flags),
         (Column("frame_flags", "bits", "PoseFlag bits known before any pose was sought"),
          pa.array(observations.frame_flags)),
     ]  # fmt: skip
-    return _table(columns, metadata)
+    return make_table(columns, metadata)
 
 
 def fused_table(
@@ -134,7 +134,7 @@ def fused_table(
     is_edge = (number >= 0)[order]
     omega = joined("omega_brick_radps")[order]
     v_mmps = joined("v_camera_mmps")[order]
-    columns: _Columns = [
+    columns: Columns = [
         (Column("kind", "", "what fixes the instant: imu (slot), frame (picture) or edge (square wave)"),
          pa.array([kinds[k] for k in kind_of[order]], type=pa.string())),
         (Column("edge_index", "1", "number of the rising edge, 0 at the first; empty in other rows"),
@@ -142,13 +142,13 @@ def fused_table(
         *_time_columns(t_ns[order], t0_ns, edge_fit),
         *_pose_columns(joined("R_camera_brick")[order], joined("t_camera_brick_mm")[order],
                        joined("covariance")[order], rest),
-        *_vector_columns("omega_{}_radps", "rad/s", "angular rate in brick axes", omega),
-        *_vector_columns("v_{}_mmps", "mm/s", "velocity of the first LED, camera axes", v_mmps),
-        *_vector_columns("dv_{}_mmps", "mm/s", "velocity of the first LED, brick axes at rest",
+        *vector_columns("omega_{}_radps", "rad/s", "angular rate in brick axes", omega),
+        *vector_columns("v_{}_mmps", "mm/s", "velocity of the first LED, camera axes", v_mmps),
+        *vector_columns("dv_{}_mmps", "mm/s", "velocity of the first LED, brick axes at rest",
                          _turned(v_mmps, rest)),
-        *_flag_columns(joined("flags")[order]),
+        *flag_columns(joined("flags")[order]),
     ]  # fmt: skip
-    return _table(columns, metadata)
+    return make_table(columns, metadata)
 
 
 def leds_table(
@@ -166,7 +166,7 @@ def leds_table(
     residual = optical.residual_px.reshape(-1, 2)
     flags = observations.led_flags.reshape(-1)
     led_t_ns = optical.led_t_ns.reshape(-1)
-    columns: _Columns = [
+    columns: Columns = [
         (Column("frame", "1", "number of the frame record in the run"),
          pa.array(np.repeat(np.arange(n_frames), n_leds))),
         (Column("led", "", "name in the layout file"),
@@ -187,35 +187,35 @@ def leds_table(
         (Column("flag_words", "", "names of the LedFlag bits, parted by |"),
          pa.array(led_flag_words(flags), type=pa.string())),
     ]  # fmt: skip
-    return _table(columns, metadata)
+    return make_table(columns, metadata)
 
 
 def imu_table(imu: ImuTrack, *, t0_ns: int | None, metadata: dict[str, str]) -> "pa.Table":
     """Return the table of inertial samples in brick axes, as the fusion used them."""
-    columns: _Columns = [
+    columns: Columns = [
         *_time_columns(imu.t_ns, t0_ns, None)[:2],
-        *_vector_columns("acc_{}_mps2", "m/s^2", "specific force in brick axes", imu.acc_mps2),
-        *_vector_columns("gyro_{}_radps", "rad/s", "angular rate in brick axes, with bias", imu.gyro_radps),
+        *vector_columns("acc_{}_mps2", "m/s^2", "specific force in brick axes", imu.acc_mps2),
+        *vector_columns("gyro_{}_radps", "rad/s", "angular rate in brick axes, with bias", imu.gyro_radps),
         (Column("flags", "bits", "ImuFlag bits"), pa.array(imu.flags)),
         (Column("flag_words", "", "names of the ImuFlag bits, parted by |"),
          pa.array(_words(imu.flags, ImuFlag), type=pa.string())),
     ]  # fmt: skip
-    return _table(columns, metadata)
+    return make_table(columns, metadata)
 
 
 def edges_table(edge_fit: EdgeFit, *, t0_ns: int | None, metadata: dict[str, str]) -> "pa.Table":
     """Return the table of recorded edges and their numbers."""
-    columns: _Columns = [
+    columns: Columns = [
         *_time_columns(edge_fit.edges_ns, t0_ns, None)[:2],
         (Column("edge_index", "1", "number in the square wave; empty where the edge belongs to no sample"),
          pa.array(edge_fit.index, mask=edge_fit.is_extra)),
         (Column("residual_ns", "ns", "edge less fitted line, positive when late"),
          pa.array(edge_fit.residual_ns)),
     ]  # fmt: skip
-    return _table(columns, metadata)
+    return make_table(columns, metadata)
 
 
-def _time_columns(t_ns: IntArray, t0_ns: int | None, edge_fit: EdgeFit | None) -> _Columns:
+def _time_columns(t_ns: IntArray, t0_ns: int | None, edge_fit: EdgeFit | None) -> Columns:
     t_s = np.full(len(t_ns), np.nan) if t0_ns is None else (t_ns - t0_ns) / 1e9
     sample = np.full(len(t_ns), np.nan) if edge_fit is None else edge_fit.sample_index_of(t_ns)
     return [
@@ -226,7 +226,7 @@ def _time_columns(t_ns: IntArray, t0_ns: int | None, edge_fit: EdgeFit | None) -
     ]  # fmt: skip
 
 
-def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest: RestPose | None) -> _Columns:
+def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest: RestPose | None) -> Columns:
     q = continuous_quaternions(quaternion_from_matrix(R))
     if rest is None:
         R_rest, d_mm = np.full_like(R, np.nan), np.full_like(t_mm, np.nan)
@@ -240,43 +240,45 @@ def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest:
     triangle = covariance[:, _TRIANGLE[0], _TRIANGLE[1]]
     packed = pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(triangle).reshape(-1)), 21)
     return [
-        *_vector_columns("{}_mm", "mm", "position of the first LED, camera frame", t_mm),
+        *vector_columns("{}_mm", "mm", "position of the first LED, camera frame", t_mm),
         *(
             (Column(f"q_{c}", "1", "unit quaternion, brick to camera"), pa.array(q[:, i].copy()))
             for i, c in enumerate("wxyz")
         ),
-        *_vector_columns("rvec_{}_rad", "rad", "rotation vector, brick to camera", rvec_from_matrix(R)),
-        *_vector_columns(
+        *vector_columns("rvec_{}_rad", "rad", "rotation vector, brick to camera", rvec_from_matrix(R)),
+        *vector_columns(
             "angle_{}_deg",
             "deg",
             "intrinsic XYZ angle, brick to camera",
             np.rad2deg(angles_xyz_from_matrix(R)),
         ),
-        *_vector_columns("d{}_mm", "mm", "displacement of the first LED from rest, brick axes at rest", d_mm),
-        *_vector_columns("drvec_{}_rad", "rad", "rotation vector from rest", rvec_from_matrix(R_rest)),
-        *_vector_columns(
+        *vector_columns("d{}_mm", "mm", "displacement of the first LED from rest, brick axes at rest", d_mm),
+        *vector_columns("drvec_{}_rad", "rad", "rotation vector from rest", rvec_from_matrix(R_rest)),
+        *vector_columns(
             "dangle_{}_deg",
             "deg",
             "intrinsic XYZ angle from rest",
             np.rad2deg(angles_xyz_from_matrix(R_rest)),
         ),
-        *_vector_columns("sd_{}_mm", "mm", "standard deviation of the position, camera axes", sd[:, 3:]),
-        *_vector_columns("sd_d{}_mm", "mm", "standard deviation of the position, brick axes at rest", d_sd),
-        *_vector_columns(
+        *vector_columns("sd_{}_mm", "mm", "standard deviation of the position, camera axes", sd[:, 3:]),
+        *vector_columns("sd_d{}_mm", "mm", "standard deviation of the position, brick axes at rest", d_sd),
+        *vector_columns(
             "sd_rot_{}_deg", "deg", "standard deviation of the rotation, brick axes", np.rad2deg(sd[:, :3])
         ),
         (Column("covariance", "rad, mm", "see the table's conventions; left out of the CSV"), packed),
     ]
 
 
-def _vector_columns(name: str, unit: str, meaning: str, values: FloatArray) -> _Columns:
+def vector_columns(name: str, unit: str, meaning: str, values: FloatArray) -> Columns:
+    """Return three columns, x, y and z; ``{}`` in the name stands for the letter."""
     return [
         (Column(name.format(c), unit, f"{meaning}: {c}"), pa.array(np.ascontiguousarray(values[:, i])))
         for i, c in enumerate(_XYZ)
     ]
 
 
-def _flag_columns(flags: IntArray) -> _Columns:
+def flag_columns(flags: IntArray) -> Columns:
+    """Return `PoseFlag` bits and their names."""
     return [
         (Column("flags", "bits", "PoseFlag bits"), pa.array(flags)),
         (
@@ -290,7 +292,8 @@ def _turned(v_camera: FloatArray, rest: RestPose | None) -> FloatArray:
     return np.full_like(v_camera, np.nan) if rest is None else np.asarray(v_camera @ rest.R_camera_rest)
 
 
-def _table(columns: _Columns, metadata: dict[str, str]) -> "pa.Table":
+def make_table(columns: Columns, metadata: dict[str, str]) -> "pa.Table":
+    """Return a table whose schema carries unit and meaning of each column."""
     fields = [
         pa.field(c.name, array.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c, array in columns
     ]

@@ -14,6 +14,7 @@ from bricktrack_common.key_files import check_public_key
 from bricktrack_common.run_manifest import RUN_ID_PATTERN
 from bricktrack_common.typed_data import load_toml
 from bricktrack_common.wire_messages import HelloReply
+from bricktrack_host.transfer.assembly_config import AssemblyConfig, check_assembly
 
 CameraMount = Literal["static", "imu", "table"]
 
@@ -73,11 +74,12 @@ class HostTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The units of a laboratory, the folder that their runs go to, and this host's key."""
+    """The units of a laboratory, what they watch, the folder that runs go to, and this host's key."""
 
     unit: Annotated[list[UnitConfig], msgspec.Meta(min_length=1)]
     runs_folder: str = "runs"
     host: HostTable = HostTable()
+    assembly: list[AssemblyConfig] = []
 
     @property
     def runs_path(self) -> Path:
@@ -140,8 +142,14 @@ def load_fleet(path: Path) -> Fleet:
                 f"{where}.server_key: the unit asks who we are, and {path} names no key of this host. "
                 "Make one with 'bricktrack keys create' and name it under [host] as secret_key"
             )
+    names = [unit.name for unit in units]
+    for i, assembly in enumerate(fleet.assembly):
+        check_assembly(assembly, names, where=f"{path}: assembly[{i}]")
+        if [other.name for other in fleet.assembly].count(assembly.name) > 1:
+            raise ConfigError(f"{path}: assembly[{i}].name: {assembly.name!r} stands twice")
     return Fleet(
         unit=units,
+        assembly=fleet.assembly,
         runs_folder=_below(base, fleet.runs_folder),
         host=HostTable(secret_key=_below(base, fleet.host.secret_key)),
     )

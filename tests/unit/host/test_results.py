@@ -205,7 +205,7 @@ def test_a_full_disk_is_said_and_leaves_no_result(result, tmp_path, monkeypatch)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(results_module.pa.parquet, "write_table", full)
-    with pytest.raises(StorageError, match="No space left"):
+    with pytest.raises(StorageError, match="no space left"):
         write_results(result, tmp_path / "results")
     assert not (tmp_path / "results").exists()
 
