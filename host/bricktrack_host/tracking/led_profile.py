@@ -134,7 +134,7 @@ def predict_leds(
         np.ascontiguousarray(axes.reshape(-1, 3)),
         radii.reshape(-1),
         np.nan if collar_mm is None else collar_mm,
-        hits.reshape(-1, 6, 4),
+        hits.reshape(-1, 1, 6, 4),
         a,
         b - a,
     )
@@ -168,14 +168,15 @@ def _predict_all(
     """Return centroid, area, facing and what is across the axis, (n, 6), and both Jacobians, (n, 2, 3)."""
     n = len(uv)
     out, J_centre, J_axis = np.empty((n, 6)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
-    shape = np.empty(N_SHAPE)
+    shape = np.empty((1, N_SHAPE))
     for i in range(n):
-        led_shape(centres[i], axes[i], radii[i], collar, hits[i], plane_a, apart, shape)
-        du, dv, facing, magnification = led_view(
-            centres[i], axes[i], hits[i], plane_a, apart, shape, J_centre[i], J_axis[i], out[i, 4:]
+        led_shape(centres[i], axes[i], radii[i], collar, hits, i, 0, plane_a, apart, shape)
+        du, dv, facing, magnification, shown_u, shown_v = led_view(
+            centres[i], axes[i], hits, i, 0, plane_a, apart, shape, J_centre[i], J_axis[i]
         )
         out[i, 0], out[i, 1] = uv[i, 0] + du, uv[i, 1] + dv
-        out[i, 2], out[i, 3] = shape[AREA] * magnification, facing
+        out[i, 2], out[i, 3] = shape[0, AREA] * magnification, facing
+        out[i, 4], out[i, 5] = shown_u, shown_v
     return out, J_centre, J_axis
 
 

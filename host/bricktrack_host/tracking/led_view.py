@@ -10,11 +10,12 @@ import math
 from bricktrack_common.arrays import FloatArray
 from bricktrack_host.compiled import compiled
 
-FACING, PER_SINE, SLOPE, HALF_LENGTH, AREA, LENS_U, LENS_V = range(7)
-N_SHAPE = 7
-"""An LED's shape: facing where it was had; shift of the centroid along the projected axis over the sine of
-the view angle, mm, and its derivative by the facing; half length of the outline, mm; its area, mm^2; what the
-lens's curvature adds to the centroid, px."""
+SINE, SHIFT, SHIFT_1, SHIFT_2, HALF_LENGTH, AREA, LENS_U, LENS_V = range(8)
+N_SHAPE = 8
+"""An LED's shape: sine of the view angle about which the next three expand the shift of the centroid along
+the projected axis over that sine, mm; half length of the outline, mm; its area, mm^2; what the lens's
+curvature adds to the centroid, px."""
+_SINE_STEP = 0.02
 
 
 @compiled
@@ -53,7 +54,7 @@ def outline(c: float, r: float, h: float, distance: float) -> tuple[float, float
 
 @compiled
 def pixel_near(
-    x: float, y: float, b: float, hits: FloatArray
+    x: float, y: float, b: float, hits: FloatArray, i: int, k: int
 ) -> tuple[float, float, float, float, float, float, float, float]:
     """Return where a point falls, from the rays near a pixel.
 
@@ -62,7 +63,8 @@ def pixel_near(
     x, y : float, mm
     b : float
         Depth of the point: 0 on plane a, 1 on plane b.
-    hits : ndarray, shape (6, 4)
+    hits : ndarray, shape (n, n_leds, 6, 4)
+        Of which those of LED ``k`` in frame ``i`` are taken.
 
     Returns
     -------
@@ -73,20 +75,20 @@ def pixel_near(
         Slopes of its ray, over the distance of the planes.
     """
     a = 1 - b
-    ex, ey = x - a * hits[0, 0] - b * hits[0, 2], y - a * hits[0, 1] - b * hits[0, 3]
-    m00, m01 = a * hits[1, 0] + b * hits[1, 2], a * hits[2, 0] + b * hits[2, 2]
-    m10, m11 = a * hits[1, 1] + b * hits[1, 3], a * hits[2, 1] + b * hits[2, 3]
+    ex, ey = x - a * hits[i, k, 0, 0] - b * hits[i, k, 0, 2], y - a * hits[i, k, 0, 1] - b * hits[i, k, 0, 3]
+    m00, m01 = a * hits[i, k, 1, 0] + b * hits[i, k, 1, 2], a * hits[i, k, 2, 0] + b * hits[i, k, 2, 2]
+    m10, m11 = a * hits[i, k, 1, 1] + b * hits[i, k, 1, 3], a * hits[i, k, 2, 1] + b * hits[i, k, 2, 3]
     det = m00 * m11 - m01 * m10
     i00, i01, i10, i11 = m11 / det, -m01 / det, -m10 / det, m00 / det
     xuu, xuv, xvv = (
-        a * hits[3, 0] + b * hits[3, 2],
-        a * hits[4, 0] + b * hits[4, 2],
-        a * hits[5, 0] + b * hits[5, 2],
+        a * hits[i, k, 3, 0] + b * hits[i, k, 3, 2],
+        a * hits[i, k, 4, 0] + b * hits[i, k, 4, 2],
+        a * hits[i, k, 5, 0] + b * hits[i, k, 5, 2],
     )
     yuu, yuv, yvv = (
-        a * hits[3, 1] + b * hits[3, 3],
-        a * hits[4, 1] + b * hits[4, 3],
-        a * hits[5, 1] + b * hits[5, 3],
+        a * hits[i, k, 3, 1] + b * hits[i, k, 3, 3],
+        a * hits[i, k, 4, 1] + b * hits[i, k, 4, 3],
+        a * hits[i, k, 5, 1] + b * hits[i, k, 5, 3],
     )
     du, dv = i00 * ex + i01 * ey, i10 * ex + i11 * ey
     for _ in range(2):  # the quadratic part: 1e-4 px at 1 px from the pixel, 0.1 px at 30
@@ -96,8 +98,18 @@ def pixel_near(
     m00, m01 = m00 + xuu * du + xuv * dv, m01 + xuv * du + xvv * dv
     m10, m11 = m10 + yuu * du + yuv * dv, m11 + yuv * du + yvv * dv
     det = m00 * m11 - m01 * m10
-    kx = hits[0, 2] - hits[0, 0] + (hits[1, 2] - hits[1, 0]) * du + (hits[2, 2] - hits[2, 0]) * dv
-    ky = hits[0, 3] - hits[0, 1] + (hits[1, 3] - hits[1, 1]) * du + (hits[2, 3] - hits[2, 1]) * dv
+    kx = (
+        hits[i, k, 0, 2]
+        - hits[i, k, 0, 0]
+        + (hits[i, k, 1, 2] - hits[i, k, 1, 0]) * du
+        + (hits[i, k, 2, 2] - hits[i, k, 2, 0]) * dv
+    )
+    ky = (
+        hits[i, k, 0, 3]
+        - hits[i, k, 0, 1]
+        + (hits[i, k, 1, 3] - hits[i, k, 1, 1]) * du
+        + (hits[i, k, 2, 3] - hits[i, k, 2, 1]) * dv
+    )
     return du, dv, m11 / det, -m01 / det, -m10 / det, m00 / det, kx, ky
 
 
@@ -108,32 +120,38 @@ def led_shape(
     radius: float,
     collar: float,
     hits: FloatArray,
+    i: int,
+    k: int,
     plane_a: float,
     apart: float,
     shape: FloatArray,
 ) -> None:
-    """Fill in an LED's shape, see `N_SHAPE`; ``collar`` is NaN where no profile was fitted."""
-    _, _, i00, i01, i10, i11, kx, ky = pixel_near(centre[0], centre[1], (centre[2] - plane_a) / apart, hits)
+    """Fill in the shape of LED ``k`` in frame ``i``, see `N_SHAPE`; no fitted ``collar`` is NaN."""
+    share = (centre[2] - plane_a) / apart
+    _, _, i00, i01, i10, i11, kx, ky = pixel_near(centre[0], centre[1], share, hits, i, k)
     kx, ky = kx / apart, ky / apart
     norm = math.sqrt(kx * kx + ky * ky + 1)
     dx, dy, dz = kx / norm, ky / norm, 1 / norm
     along = axis[0] * dx + axis[1] * dy + axis[2] * dz
     distance = centre[2] / dz
-    shape[FACING] = -along
-    if math.isnan(collar):  # the sphere's own outline
-        half = radius / math.sqrt(1 - (radius / distance) ** 2)
-        shape[PER_SINE], shape[SLOPE], shape[HALF_LENGTH], shape[AREA] = 0.0, 0.0, half, math.pi * half**2
-    else:
-        step = 1e-4
-        c = min(max(-along, -1 + 2 * step), 1 - 2 * step)
-        area, low, half = outline(c - step, radius, collar, distance)
-        area_2, high, half_2 = outline(c + step, radius, collar, distance)
-        low, high = low / math.sqrt(1 - (c - step) ** 2), high / math.sqrt(1 - (c + step) ** 2)
-        shape[PER_SINE], shape[SLOPE] = 0.5 * (low + high), (high - low) / (2 * step)
-        shape[HALF_LENGTH], shape[AREA] = 0.5 * (half + half_2), 0.5 * (area + area_2)
-    # Unit vectors across the line of sight, the first along the projected axis.
     ax, ay, az = axis[0] - along * dx, axis[1] - along * dy, axis[2] - along * dz
     s = math.sqrt(ax * ax + ay * ay + az * az)
+    if math.isnan(collar):  # the sphere's own outline
+        half = radius / math.sqrt(1 - (radius / distance) ** 2)
+        shape[k, SINE], shape[k, SHIFT], shape[k, SHIFT_1], shape[k, SHIFT_2] = s, 0.0, 0.0, 0.0
+        shape[k, HALF_LENGTH], shape[k, AREA] = half, math.pi * half**2
+    else:
+        at = min(max(s, 1.5 * _SINE_STEP), 1 - 1.5 * _SINE_STEP)
+        side = 1.0 if along <= 0 else -1.0
+        _, low, _ = outline(side * math.sqrt(1 - (at - _SINE_STEP) ** 2), radius, collar, distance)
+        area, middle, half = outline(side * math.sqrt(1 - at * at), radius, collar, distance)
+        _, high, _ = outline(side * math.sqrt(1 - (at + _SINE_STEP) ** 2), radius, collar, distance)
+        low, middle, high = low / (at - _SINE_STEP), middle / at, high / (at + _SINE_STEP)
+        shape[k, SINE], shape[k, SHIFT] = at, middle
+        shape[k, SHIFT_1] = (high - low) / (2 * _SINE_STEP)
+        shape[k, SHIFT_2] = (high - 2 * middle + low) / (2 * _SINE_STEP**2)
+        shape[k, HALF_LENGTH], shape[k, AREA] = half, area
+    # Unit vectors across the line of sight, the first along the projected axis.
     if s > 1e-6:
         e1x, e1y, e1z = ax / s, ay / s, az / s
     else:
@@ -143,17 +161,16 @@ def led_shape(
     # How they show in the picture, to first and second order.
     a0, a1 = i00 * (e1x - kx * e1z) + i01 * (e1y - ky * e1z), i10 * (e1x - kx * e1z) + i11 * (e1y - ky * e1z)
     b0, b1 = i00 * (e2x - kx * e2z) + i01 * (e2y - ky * e2z), i10 * (e2x - kx * e2z) + i11 * (e2y - ky * e2z)
-    share = (centre[2] - plane_a) / apart
-    aa0, aa1 = _bend(a0, a1, e1z, a0, a1, e1z, share, apart, hits, i00, i01, i10, i11)
-    ab0, ab1 = _bend(a0, a1, e1z, b0, b1, e2z, share, apart, hits, i00, i01, i10, i11)
-    bb0, bb1 = _bend(b0, b1, e2z, b0, b1, e2z, share, apart, hits, i00, i01, i10, i11)
+    aa0, aa1 = _bend(a0, a1, e1z, a0, a1, e1z, share, apart, hits, i, k, i00, i01, i10, i11)
+    ab0, ab1 = _bend(a0, a1, e1z, b0, b1, e2z, share, apart, hits, i, k, i00, i01, i10, i11)
+    bb0, bb1 = _bend(b0, b1, e2z, b0, b1, e2z, share, apart, hits, i, k, i00, i01, i10, i11)
     det = a0 * b1 - a1 * b0
     # Growth of the picture's area per area along e1 and e2.
     grow_1 = (b1 * aa0 - b0 * aa1 - a1 * ab0 + a0 * ab1) / det
     grow_2 = (b1 * ab0 - b0 * ab1 - a1 * bb0 + a0 * bb1) / det
-    var_1, var_2 = 0.25 * shape[HALF_LENGTH] ** 2, 0.25 * radius**2
-    shape[LENS_U] = var_1 * (0.5 * aa0 + grow_1 * a0) + var_2 * (0.5 * bb0 + grow_2 * b0)
-    shape[LENS_V] = var_1 * (0.5 * aa1 + grow_1 * a1) + var_2 * (0.5 * bb1 + grow_2 * b1)
+    var_1, var_2 = 0.25 * shape[k, HALF_LENGTH] ** 2, 0.25 * radius**2
+    shape[k, LENS_U] = var_1 * (0.5 * aa0 + grow_1 * a0) + var_2 * (0.5 * bb0 + grow_2 * b0)
+    shape[k, LENS_V] = var_1 * (0.5 * aa1 + grow_1 * a1) + var_2 * (0.5 * bb1 + grow_2 * b1)
 
 
 @compiled
@@ -167,6 +184,8 @@ def _bend(
     share: float,
     apart: float,
     hits: FloatArray,
+    i: int,
+    k: int,
     i00: float,
     i01: float,
     i10: float,
@@ -177,16 +196,14 @@ def _bend(
     The directions are given by their pixels' first derivatives, (a0, a1) and (b0, b1), and their depths. From
     the implicit ``X(pixel, z) = (x, y)``: ``d2u = -M^-1 [X_uu(a, b) + X_uz(a) bz + X_uz(b) az]``.
     """
-    x, y = 0.0, 0.0
-    for k in range(2):
-        w = 1 - share if k == 0 else share
-        c = 2 * k
-        cross = a0 * b1 + a1 * b0
-        x += w * (hits[3, c] * a0 * b0 + hits[4, c] * cross + hits[5, c] * a1 * b1)
-        y += w * (hits[3, c + 1] * a0 * b0 + hits[4, c + 1] * cross + hits[5, c + 1] * a1 * b1)
+    aa, cross, bb = a0 * b0, a0 * b1 + a1 * b0, a1 * b1
     g0, g1 = (a0 * bz + b0 * az) / apart, (a1 * bz + b1 * az) / apart
-    x += (hits[1, 2] - hits[1, 0]) * g0 + (hits[2, 2] - hits[2, 0]) * g1
-    y += (hits[1, 3] - hits[1, 1]) * g0 + (hits[2, 3] - hits[2, 1]) * g1
+    x = (1 - share) * (hits[i, k, 3, 0] * aa + hits[i, k, 4, 0] * cross + hits[i, k, 5, 0] * bb)
+    x += share * (hits[i, k, 3, 2] * aa + hits[i, k, 4, 2] * cross + hits[i, k, 5, 2] * bb)
+    x += (hits[i, k, 1, 2] - hits[i, k, 1, 0]) * g0 + (hits[i, k, 2, 2] - hits[i, k, 2, 0]) * g1
+    y = (1 - share) * (hits[i, k, 3, 1] * aa + hits[i, k, 4, 1] * cross + hits[i, k, 5, 1] * bb)
+    y += share * (hits[i, k, 3, 3] * aa + hits[i, k, 4, 3] * cross + hits[i, k, 5, 3] * bb)
+    y += (hits[i, k, 1, 3] - hits[i, k, 1, 1]) * g0 + (hits[i, k, 2, 3] - hits[i, k, 2, 1]) * g1
     return -(i00 * x + i01 * y), -(i10 * x + i11 * y)
 
 
@@ -195,26 +212,25 @@ def led_view(
     centre: FloatArray,
     axis: FloatArray,
     hits: FloatArray,
+    i: int,
+    k: int,
     plane_a: float,
     apart: float,
     shape: FloatArray,
     J_centre: FloatArray,
     J_axis: FloatArray,
-    across_px: FloatArray,
-) -> tuple[float, float, float, float]:
-    """Return where an LED is seen, and fill in its derivatives.
+) -> tuple[float, float, float, float, float, float]:
+    """Return where LED ``k`` of frame ``i`` is seen, and fill in its derivatives.
 
     Parameters
     ----------
     centre, axis : ndarray, shape (3,), mm, camera frame
-    hits : ndarray, shape (6, 4)
+    hits : ndarray, shape (n, n_leds, 6, 4)
     plane_a, apart : float, mm
         Depth of plane a, and from it to plane b.
-    shape : ndarray, shape (N_SHAPE,)
+    shape : ndarray, shape (n_leds, N_SHAPE)
     J_centre : ndarray, shape (2, 3), px/mm, out
     J_axis : ndarray, shape (2, 3), px, out
-    across_px : ndarray, shape (2,), px/mm, out
-        What one millimetre along the projected axis is in the picture, times the sine of the view angle.
 
     Returns
     -------
@@ -223,33 +239,41 @@ def led_view(
     facing : float
     magnification : float, px^2/mm^2
         Of the plane across the line of sight.
+    shown_u, shown_v : float, px/mm
+        What one millimetre along the projected axis is in the picture, times the sine of the view angle.
     """
-    _, _, _, _, _, _, kx, ky = pixel_near(centre[0], centre[1], (centre[2] - plane_a) / apart, hits)
+    _, _, _, _, _, _, kx, ky = pixel_near(centre[0], centre[1], (centre[2] - plane_a) / apart, hits, i, k)
     kx, ky = kx / apart, ky / apart
     norm = math.sqrt(kx * kx + ky * ky + 1)
     dx, dy, dz = kx / norm, ky / norm, 1 / norm
     along = axis[0] * dx + axis[1] * dy + axis[2] * dz
     ax, ay, az = axis[0] - along * dx, axis[1] - along * dy, axis[2] - along * dz
-    slope = shape[SLOPE]
-    per_sine = shape[PER_SINE] + slope * (-along - shape[FACING])
+    s = max(math.sqrt(ax * ax + ay * ay + az * az), 1e-9)
+    ds = s - shape[k, SINE]
+    per_sine = shape[k, SHIFT] + ds * (shape[k, SHIFT_1] + ds * shape[k, SHIFT_2])
+    slope = (shape[k, SHIFT_1] + 2 * ds * shape[k, SHIFT_2]) * along / s  # by the facing, -along
+    x, y, z = centre[0] + per_sine * ax, centre[1] + per_sine * ay, centre[2] + per_sine * az
+    du, dv, i00, i01, i10, i11, kx, ky = pixel_near(x, y, (z - plane_a) / apart, hits, i, k)
+    kx, ky = kx / apart, ky / apart
+    # Moving the LED turns its line of sight, and with it what is seen of the shift:
+    # J (1 + p (1 - d d') - q across across'), and by the axis J (per_sine (1 - d d') - slope across d').
     per_distance = dz / centre[2]
     p, q = -along * per_sine * per_distance, slope * per_distance
-    x, y, z = centre[0] + per_sine * ax, centre[1] + per_sine * ay, centre[2] + per_sine * az
-    du, dv, i00, i01, i10, i11, kx, ky = pixel_near(x, y, (z - plane_a) / apart, hits)
-    kx, ky = kx / apart, ky / apart
-    for k in range(2):
-        j0, j1 = (i00, i01) if k == 0 else (i10, i11)
-        j2 = -(j0 * kx + j1 * ky)
-        shown = j0 * ax + j1 * ay + j2 * az
-        across_px[k] = shown
-        # Moving the LED turns its line of sight, and with it what is seen of the shift:
-        # J (1 + p (1 - d d') - q across across'), and by the axis J (per_sine (1 - d d') - slope across d').
-        J_centre[k, 0] = j0 * (1 + p) - q * shown * ax
-        J_centre[k, 1] = j1 * (1 + p) - q * shown * ay
-        # What the lens adds falls with the square of the distance.
-        J_centre[k, 2] = j2 * (1 + p) - q * shown * az - 2 * shape[LENS_U + k] / centre[2]
-        J_axis[k, 0] = per_sine * j0 - slope * shown * dx
-        J_axis[k, 1] = per_sine * j1 - slope * shown * dy
-        J_axis[k, 2] = per_sine * j2 - slope * shown * dz
+    u2, v2 = -(i00 * kx + i01 * ky), -(i10 * kx + i11 * ky)
+    shown_u, shown_v = i00 * ax + i01 * ay + u2 * az, i10 * ax + i11 * ay + v2 * az
+    # What the lens adds falls with the square of the distance.
+    lens_u, lens_v = shape[k, LENS_U], shape[k, LENS_V]
+    J_centre[0, 0] = i00 * (1 + p) - q * shown_u * ax
+    J_centre[0, 1] = i01 * (1 + p) - q * shown_u * ay
+    J_centre[0, 2] = u2 * (1 + p) - q * shown_u * az - 2 * lens_u / centre[2]
+    J_centre[1, 0] = i10 * (1 + p) - q * shown_v * ax
+    J_centre[1, 1] = i11 * (1 + p) - q * shown_v * ay
+    J_centre[1, 2] = v2 * (1 + p) - q * shown_v * az - 2 * lens_v / centre[2]
+    J_axis[0, 0] = per_sine * i00 - slope * shown_u * dx
+    J_axis[0, 1] = per_sine * i01 - slope * shown_u * dy
+    J_axis[0, 2] = per_sine * u2 - slope * shown_u * dz
+    J_axis[1, 0] = per_sine * i10 - slope * shown_v * dx
+    J_axis[1, 1] = per_sine * i11 - slope * shown_v * dy
+    J_axis[1, 2] = per_sine * v2 - slope * shown_v * dz
     # Area of the picture per area across the line of sight: that per area of (x, y), over dz.
-    return du + shape[LENS_U], dv + shape[LENS_V], -along, abs(i00 * i11 - i01 * i10) / dz
+    return du + lens_u, dv + lens_v, -along, abs(i00 * i11 - i01 * i10) / dz, shown_u, shown_v

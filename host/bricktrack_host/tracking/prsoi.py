@@ -14,6 +14,7 @@ stays for comparison with the literature.
 Everything is vectorised over frames, each with its own set of seen LEDs.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,8 +25,9 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_a
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError
-from bricktrack_common.rotations import nearest_rotation
+from bricktrack_host.compiled import compiled
 from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
 
 PrsoiForm = Literal["safe", "printed"]
 
@@ -104,10 +106,8 @@ def prsoi_starts(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the PRSOI poses, (n, 3, 3) and (n, 3), of centroids (n, n_leds, 2), NaN where unseen."""
     a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
-    on_a, on_b = np.full_like(uv_px, np.nan), np.full_like(uv_px, np.nan)
-    seen = all_finite(uv_px)
-    on_a[seen] = ray_model.points_on_plane(uv_px[seen], a)
-    on_b[seen] = ray_model.points_on_plane(uv_px[seen], b)
+    hits = expand_at(hit_polynomials(ray_model), uv_px)[..., 0, :]
+    on_a, on_b = hits[..., :2], hits[..., 2:]
     found = prsoi_poses(on_a, on_b, brick_model.led_positions_mm, plane_a_mm=a, plane_b_mm=b, form=form)
     return found.R_camera_brick, found.t_camera_brick_mm
 
@@ -135,14 +135,19 @@ def _iterate(
     reference = np.argmax(seen, axis=1)
     rows = np.arange(n)
     G = np.where(seen[..., None], P[None] - P[reference][:, None], 0.0)
-    depth_mm = np.linalg.svd(G, compute_uv=False)[..., -1]
-    active = rows[(seen.sum(axis=1) >= 4) & (depth_mm >= _MIN_DEPTH_MM)]
+    # G, and with it H, are the same for all frames that see the same LEDs.
+    _, first, which = np.unique(
+        seen @ (1 << np.arange(seen.shape[1])), return_index=True, return_inverse=True
+    )
+    depth_mm = np.linalg.svd(G[first], compute_uv=False)[..., -1]
+    pseudo_inverses = np.linalg.pinv(G[first])
+    active = rows[(seen.sum(axis=1) >= 4) & (depth_mm[which] >= _MIN_DEPTH_MM)]
     if active.size == 0:
         return PrsoiPoses(R_all, t_all, converged, n_iterations)
     G, seen, reference = G[active], seen[active], reference[active]
     A, B = A[active], B[active]
     here = np.arange(active.size)
-    H = np.linalg.pinv(G)
+    H = pseudo_inverses[which[active]]
     A0, B0 = A[here, reference], B[here, reference]
     used = seen.copy()
     used[here, reference] = False
@@ -156,40 +161,106 @@ def _iterate(
     else:
         kappa = np.broadcast_to(kappa_one[:, None, None], dA.shape)
 
-    m = np.zeros(active.size)
-    eps = np.zeros(used.shape)
-    R = np.empty((active.size, 3, 3))
-    done = np.zeros(active.size, dtype=bool)
-    count = np.zeros(active.size, dtype=np.int64)
-    with np.errstate(all="ignore"):
-        for step in range(max_iterations):
-            scale = (b - m[:, None, None]) + (m - a)[:, None, None] * kappa
-            X = dA + np.where(used[..., None], BA * eps[..., None] / scale, 0.0) if step else dA
-            IJ = H @ X  # (n, 3, 2): I and J as columns
-            lengths = np.linalg.norm(IJ, axis=1)
-            s = np.sqrt(lengths[:, 0] * lengths[:, 1])
-            i, j = IJ[..., 0] / s[:, None], IJ[..., 1] / s[:, None]
-            k = cross_sign * np.cross(i, j)
-            per_led = ((b - a) / s[:, None, None] - b + a * kappa) / (kappa - 1)  # eq. 20
-            if printed:
-                m = np.where(used[..., None], per_led, 0.0).sum(axis=(1, 2)) / (2 * used.sum(axis=1))
-            else:
-                m = per_led[:, 0, 0]
-            new_eps = np.einsum("nlc,nc->nl", G, k)
-            change = np.abs(new_eps - eps).max(axis=1)
-            eps = new_eps
-            R[:, 0], R[:, 1], R[:, 2] = i, j, k
-            count += ~done
-            done |= change < _TOLERANCE_MM
-            if (done | ~np.isfinite(change)).all():
-                break
-    good = done & all_finite(R, 2) & np.isfinite(m)
+    kappa = np.ascontiguousarray(np.broadcast_to(kappa, dA.shape))
+    R, m, count, good = _solve_frames(
+        G, H, dA, BA, kappa, used, a, b, printed, max_iterations, cross_sign, _TOLERANCE_MM
+    )
     if good.any():
-        rotation = nearest_rotation(R[good])
         along = ((m - a) / (b - a))[:, None]
         T = np.concatenate([A0 + (B0 - A0) * along, m[:, None]], axis=1)[good]  # eq. 27
-        R_all[active[good]] = rotation
-        t_all[active[good]] = T - np.einsum("nij,nj->ni", rotation, P[reference[good]])
+        R_all[active[good]] = R[good]
+        t_all[active[good]] = T - np.einsum("nij,nj->ni", R[good], P[reference[good]])
     converged[active[good]] = True
     n_iterations[active] = count
     return PrsoiPoses(R_all, t_all, converged, n_iterations)
+
+
+@compiled
+def _solve_frames(
+    G: FloatArray,
+    H: FloatArray,
+    dA: FloatArray,
+    BA: FloatArray,
+    kappa: FloatArray,
+    used: BoolArray,
+    a: float,
+    b: float,
+    printed: bool,
+    max_iterations: int,
+    cross_sign: float,
+    tolerance_mm: float,
+) -> tuple[FloatArray, FloatArray, IntArray, BoolArray]:
+    """Iterate frame by frame; return R, (n, 3, 3), m of the reference LED, rounds, and which converged."""
+    n, n_leds = used.shape
+    R_all, m_all = np.empty((n, 3, 3)), np.empty(n)
+    count, good = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
+    eps, IJ, R = np.empty(n_leds), np.empty((2, 3)), np.empty((3, 3))
+    for f in range(n):
+        eps[:] = 0.0
+        m, change = 0.0, np.inf
+        while change > tolerance_mm and count[f] < max_iterations:
+            IJ[:] = 0.0
+            for k in range(n_leds):
+                if used[f, k]:
+                    for axis in range(2):
+                        x = dA[f, k, axis]
+                        if count[f]:
+                            x += BA[f, k, axis] * eps[k] / ((b - m) + (m - a) * kappa[f, k, axis])
+                        for c in range(3):
+                            IJ[axis, c] += H[f, c, k] * x
+            length_i = math.sqrt(IJ[0, 0] ** 2 + IJ[0, 1] ** 2 + IJ[0, 2] ** 2)
+            length_j = math.sqrt(IJ[1, 0] ** 2 + IJ[1, 1] ** 2 + IJ[1, 2] ** 2)
+            s = math.sqrt(length_i * length_j)
+            for c in range(3):
+                R[0, c], R[1, c] = IJ[0, c] / s, IJ[1, c] / s
+            for c in range(3):
+                p, q = (c + 1) % 3, (c + 2) % 3
+                R[2, c] = cross_sign * (R[0, p] * R[1, q] - R[0, q] * R[1, p])
+            total, n_used, change = 0.0, 0, 0.0
+            for k in range(n_leds):
+                if not used[f, k]:
+                    continue
+                for axis in range(2):  # eq. 20; the same for all LEDs and axes but in the printed form
+                    if printed or n_used == 0:
+                        total += ((b - a) / s - b + a * kappa[f, k, axis]) / (kappa[f, k, axis] - 1)
+                        n_used += 1
+                new = R[2, 0] * G[f, k, 0] + R[2, 1] * G[f, k, 1] + R[2, 2] * G[f, k, 2]
+                change = max(change, abs(new - eps[k])) if math.isfinite(new) else np.nan
+                eps[k] = new
+            m = total / n_used
+            count[f] += 1
+            if not (math.isfinite(change) and math.isfinite(m)):
+                break
+        for c in range(3):  # k = i x j, whatever sign the iteration was asked to take
+            R[2, c] *= cross_sign
+        good[f] = change <= tolerance_mm and math.isfinite(m) and _nearest_rotation(R, R_all[f])
+        m_all[f] = m
+    return R_all, m_all, count, good
+
+
+@compiled
+def _nearest_rotation(M: FloatArray, out: FloatArray) -> bool:
+    """Put the rotation nearest to a matrix of positive determinant into ``out``, by Newton's polar iteration.
+
+    Each round takes half the sum of the matrix and its inverse's transpose, which is its cofactors over its
+    determinant (Higham 1986). False where there is none.
+    """
+    R, new = M.copy(), np.empty((3, 3))
+    for _ in range(30):
+        for r in range(3):
+            for c in range(3):
+                r1, r2, c1, c2 = (r + 1) % 3, (r + 2) % 3, (c + 1) % 3, (c + 2) % 3
+                new[r, c] = R[r1, c1] * R[r2, c2] - R[r1, c2] * R[r2, c1]
+        det = R[0, 0] * new[0, 0] + R[0, 1] * new[0, 1] + R[0, 2] * new[0, 2]
+        if not det > 0:
+            return False
+        change = 0.0
+        for r in range(3):
+            for c in range(3):
+                x = 0.5 * (R[r, c] + new[r, c] / det)
+                change = max(change, abs(x - R[r, c]))
+                R[r, c] = x
+        if change < 1e-15:
+            break
+    out[:] = R
+    return True

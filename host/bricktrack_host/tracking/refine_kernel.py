@@ -15,7 +15,7 @@ from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view
 
 N_UNKNOWNS = 13
 _PROFILE, _TWIST = 6, 7
-_FRESH_MM, _FRESH_RAD = 0.5, 0.01  # moved less than this, an LED's shape is good to 0.001 px
+_FRESH_MM, _FRESH_RAD = 1.0, 0.05  # moved less than this, an LED's shape is good to 0.001 px
 _DONE_SIGMAS = 1e-3  # a last step this small, and the next smaller still, is far below the pose's own error
 
 
@@ -99,7 +99,6 @@ class _Room(NamedTuple):
     axis: FloatArray
     J_centre: FloatArray
     J_axis: FloatArray
-    across: FloatArray
     J: FloatArray
     R_shape: FloatArray
     t_shape: FloatArray
@@ -125,7 +124,6 @@ def _room(n_leds: int) -> _Room:
         np.empty(3),
         np.empty((2, 3)),
         np.empty((2, 3)),
-        np.empty(2),
         np.empty((2, k)),
         np.empty((3, 3)),
         np.empty(3),
@@ -142,7 +140,7 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
     n = _TWIST + 6 if observed.has_twist else _PROFILE + 1 if model.profile_sd > 0 else _PROFILE
     cost, rejected = 0.0, False
     for round_ in range(3):
-        room.R_shape[:], room.t_shape[:] = R, t
+        _copy(R, t, more, room.R_shape, room.t_shape, room.more)
         _take_shapes(i, observed, model, R, t, more, room)
         cost = _normal_equations(i, observed, model, fitted, R, t, more, room, room.A, room.g)
         damping = 1e-6
@@ -151,22 +149,24 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
                 break
             if not _solve(room.A, room.g, damping, n, room.L, room.step):
                 break
+            if _quadratic(room.A, room.step, n) < _DONE_SIGMAS**2:
+                break
             size = math.sqrt(room.step[0] ** 2 + room.step[1] ** 2 + room.step[2] ** 2)
-            if size > 0.5:
-                room.step[:] *= 0.5 / size
-            room.R[:], room.t[:], room.more[:] = R, t, more
+            for c in range(n):
+                room.step[c] *= min(1.0, 0.5 / max(size, 1e-12))
+            _copy(R, t, more, room.R, room.t, room.more)
             _move(room.R, room.t, room.more, room.step, room.E)
             new = _normal_equations(
                 i, observed, model, fitted, room.R, room.t, room.more, room, room.A_new, room.g_new
             )
             if new <= cost * (1 + 1e-12) + 1e-12:
-                small = _quadratic(room.A, room.step, n) < _DONE_SIGMAS**2
-                R[:], t[:], more[:] = room.R, room.t, room.more
-                room.A[:], room.g[:] = room.A_new, room.g_new
+                _copy(room.R, room.t, room.more, R, t, more)
+                for c in range(n):
+                    room.g[c] = room.g_new[c]
+                    for b in range(c + 1):
+                        room.A[c, b] = room.A_new[c, b]
                 cost, rejected = new, False
                 damping = max(damping / 10, 1e-9)
-                if small:
-                    break
             else:
                 rejected = True
                 damping = max(damping * 100, 1e-4)
@@ -193,10 +193,12 @@ def _take_shapes(
                 room.axis,
                 model.radii[k],
                 model.collar,
-                observed.hits[i, k],
+                observed.hits,
+                i,
+                k,
                 model.plane_a,
                 model.apart,
-                room.shapes[k],
+                room.shapes,
             )
 
 
@@ -223,15 +225,13 @@ def _place(
         for r in range(3):
             for c in range(3):
                 room.R_led[r, c] = R[r, 0] * room.E[0, c] + R[r, 1] * room.E[1, c] + R[r, 2] * room.E[2, c]
-    else:
-        dt = 0.0
-        room.R_led[:] = R
-    Rl, P, N = room.R_led, model.P, model.N
+    Rl = room.R_led if observed.has_motion else R
+    P, N = model.P, model.N
     for r in range(3):
         room.centre[r] = Rl[r, 0] * P[k, 0] + Rl[r, 1] * P[k, 1] + Rl[r, 2] * P[k, 2] + t[r]
         room.axis[r] = Rl[r, 0] * N[k, 0] + Rl[r, 1] * N[k, 1] + Rl[r, 2] * N[k, 2]
         if observed.has_motion:
-            room.centre[r] += observed.shift[i, k, r] + more[4 + r] * dt
+            room.centre[r] += observed.shift[i, k, r] + more[4 + r] * observed.dt[i, k]
 
 
 @compiled
@@ -251,39 +251,43 @@ def _normal_equations(
     n_leds = observed.seen.shape[1]
     has_profile = model.profile_sd > 0
     n = _TWIST + 6 if observed.has_twist else _PROFILE + 1 if has_profile else _PROFILE
-    A[:n, :n], g[:n] = 0.0, 0.0
-    cost = 0.0
     J = room.J
-    J[:] = 0.0
+    for c in range(n):
+        g[c] = 0.0
+        J[0, c], J[1, c] = 0.0, 0.0
+        for b in range(c + 1):
+            A[c, b] = 0.0
+    cost = 0.0
     for k in range(n_leds):
         if not observed.seen[i, k]:
             continue
         _place(i, k, observed, model, R, t, more, room)
         if not room.centre[2] > 0:
             return np.inf
-        du, dv, facing, magnification = led_view(
+        du, dv, facing, magnification, shown_u, shown_v = led_view(
             room.centre,
             room.axis,
-            observed.hits[i, k],
+            observed.hits,
+            i,
+            k,
             model.plane_a,
             model.apart,
-            room.shapes[k],
+            room.shapes,
             room.J_centre,
             room.J_axis,
-            room.across,
         )
         fitted.facing[i, k], fitted.area[i, k] = facing, room.shapes[k, AREA] * magnification
         per_profile = model.shift_per_radius * model.radii[k]
-        r0 = -du - per_profile * room.across[0] * more[0]
-        r1 = -dv - per_profile * room.across[1] * more[0]
+        r0 = -du - per_profile * shown_u * more[0]
+        r1 = -dv - per_profile * shown_v * more[0]
         for row in range(2):
-            _pose_row(row, i, k, observed, model, room)
-            if has_profile:
-                J[row, _PROFILE] = per_profile * room.across[row]
+            _pose_row(row, i, k, R, observed, model, room)
+        if has_profile:
+            J[0, _PROFILE], J[1, _PROFILE] = per_profile * shown_u, per_profile * shown_v
         w00, w01, w11 = observed.W[i, k, 0, 0], observed.W[i, k, 0, 1], observed.W[i, k, 1, 1]
         if has_profile:  # this LED's own part of what the profile leaves unknown: inverse of cov + m m'
             own = per_profile * model.own_sd
-            m0, m1 = own * room.across[0], own * room.across[1]
+            m0, m1 = own * shown_u, own * shown_v
             p0, p1 = w00 * m0 + w01 * m1, w01 * m0 + w11 * m1
             gain = 1 / (1 + m0 * p0 + m1 * p1)
             w00, w01, w11 = w00 - gain * p0 * p0, w01 - gain * p0 * p1, w11 - gain * p1 * p1
@@ -317,9 +321,10 @@ def _normal_equations(
 
 
 @compiled
-def _pose_row(row: int, i: int, k: int, observed: Observed, model: Model, room: _Room) -> None:
+def _pose_row(row: int, i: int, k: int, R: FloatArray, observed: Observed, model: Model, room: _Room) -> None:
     """Fill in one row of J: by the turn and shift of the brick, and by the twist."""
-    J, Rl, P, N = room.J, room.R_led, model.P, model.N
+    J, P, N = room.J, model.P, model.N
+    Rl = room.R_led if observed.has_motion else R
     c0, c1, c2 = room.J_centre[row, 0], room.J_centre[row, 1], room.J_centre[row, 2]
     a0, a1, a2 = room.J_axis[row, 0], room.J_axis[row, 1], room.J_axis[row, 2]
     # In brick axes; a turn theta moves the centre by R (theta x P): its row is P x (R' J).
@@ -370,6 +375,18 @@ def rotation(x: float, y: float, z: float, out: FloatArray) -> None:
 
 
 @compiled
+def _copy(
+    R: FloatArray, t: FloatArray, more: FloatArray, R_to: FloatArray, t_to: FloatArray, more_to: FloatArray
+) -> None:
+    for r in range(3):
+        t_to[r] = t[r]
+        for c in range(3):
+            R_to[r, c] = R[r, c]
+    for c in range(7):
+        more_to[c] = more[c]
+
+
+@compiled
 def _move(R: FloatArray, t: FloatArray, more: FloatArray, step: FloatArray, E: FloatArray) -> None:
     rotation(step[0], step[1], step[2], E)
     for r in range(3):
@@ -394,7 +411,8 @@ def _went_far(R: FloatArray, t: FloatArray, R_old: FloatArray, t_old: FloatArray
 @compiled
 def _solve(A: FloatArray, g: FloatArray, damping: float, n: int, L: FloatArray, x: FloatArray) -> bool:
     """Solve (A + damping diag(A)) x = g by Cholesky, L is left; false if A is singular to precision."""
-    x[:] = 0.0
+    for c in range(n, len(x)):
+        x[c] = 0.0
     for c in range(n):
         for b in range(c + 1):
             total = A[c, b]
