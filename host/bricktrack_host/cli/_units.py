@@ -10,6 +10,7 @@ import typer
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.key_files import read_secret_key
 from bricktrack_host.transfer.contact import Dialer
+from bricktrack_host.transfer.discovery import NetworkFinder
 from bricktrack_host.transfer.fleet_config import Fleet, UnitConfig, load_fleet, unit_at
 
 DEFAULT_FLEET = Path("fleet.toml")
@@ -80,4 +81,5 @@ def choose_units(
     units = fleet.select(names)
     secret = fleet.host.secret_key_path if any(u.server_key for u in units) else None
     own_keys = None if secret is None else read_secret_key(secret)
-    return ChosenUnits(units, Dialer(timeout_s=timeout_s, own_keys=own_keys), fleet)
+    dialer = Dialer(timeout_s=timeout_s, own_keys=own_keys, finder=NetworkFinder())
+    return ChosenUnits(units, dialer, fleet)

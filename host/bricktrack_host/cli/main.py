@@ -11,6 +11,7 @@ from bricktrack_host.cli import (
     configure,
     delete,
     demo,
+    find,
     fleet,
     import_cmd,
     process,
@@ -53,6 +54,7 @@ def _options(
     set_up_logging(verbose)
 
 
+app.command("find")(find.find)
 app.command("status")(status.status)
 app.command("arm")(fleet.arm)
 app.command("disarm")(fleet.disarm)
