@@ -34,7 +34,7 @@ def network():
 
 @pytest.fixture
 def finder():
-    made = NetworkFinder(open_network, search_s=1.2)
+    made = NetworkFinder(open_network, search_s=10.0)  # ends as soon as the unit is found
     yield made
     made.close()
 
@@ -52,18 +52,21 @@ def test_units_are_found_by_name_and_strangers_are_passed_over(network, finder):
     announce(network, "b2", port=41002)
     announce(network, "b1", port=41001)
     announce(network, "printer", port=631, txt={"unit": "../etc"})
+    assert finder.find(UnitConfig(name="b2")) == "tcp://127.0.0.1:41002"
+    assert finder.find(UnitConfig(name="b1")) == "tcp://127.0.0.1:41001"
+    finder._search_s = 0.0  # whoever is there has answered
     found = finder.find_all()
     assert [f.announcement.unit for f in found] == ["b1", "b2"]
     assert found[0].addresses == ("tcp://127.0.0.1:41001",)
-    assert finder.find(UnitConfig(name="b2")) == "tcp://127.0.0.1:41002"
     assert finder.find(UnitConfig(name="b3")) is None
 
 
 def test_who_announces_another_key_is_not_the_unit(network, finder):
     right, wrong = make_key_pair().public, make_key_pair().public
     announce(network, "b1", port=41001, key=fingerprint(wrong))
-    assert finder.find(UnitConfig(name="b1", server_key=right)) is None
     assert finder.find(UnitConfig(name="b1", server_key=wrong)) == "tcp://127.0.0.1:41001"
+    finder._search_s = 0.0
+    assert finder.find(UnitConfig(name="b1", server_key=right)) is None
 
 
 def test_of_several_addresses_the_one_that_answers_is_taken(network, finder):
