@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import av
+import msgspec
 import numpy as np
 import pytest
 from fault_runs import HZ, Unit, config_of, record
@@ -91,6 +92,34 @@ def test_bus_errors_are_gaps_with_their_errno(tmp_path: Path) -> None:
         )
     assert run.manifest.quality.imu_gaps >= len(failed)
     assert description.chip_id
+
+
+def test_a_clipped_accelerometer_is_flagged_where_its_registers_are_at_the_limit(tmp_path: Path) -> None:
+    # 0.2 m at 8 Hz would be 0.2 (2 pi 8)^2 = 505 m/s2, 51 g: no brick does that, but the chip must be clipped.
+    config = config_of(tmp_path, recording=LONG)
+    run = record(
+        msgspec.structs.replace(
+            config, sim=msgspec.structs.replace(config.sim, motion="sines", amplitude_mm=200.0)
+        )
+    )
+    _, records, _ = read_imu(run.folder / "imu_brick.msgpack")
+    flags = run.imus["brick"][1].flags
+    # 100 counts are 1 m/s2 (data sheet, table 3-17): 16 g are 15,691 counts.
+    first = records[0].slot
+    at_limit = {
+        r.slot - first
+        for r in records
+        if r.data is not None and np.abs(np.frombuffer(r.data[:6], dtype="<i2").astype(int)).max() >= 15_600
+    }
+    flagged = set(np.flatnonzero(flags & ImuFlag.ACC_CLIPPED).tolist())
+    assert at_limit and flagged == at_limit
+    assert run.manifest.quality.imu_clipped == len(flagged)
+
+
+def test_a_gentle_shake_is_not_called_clipped(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    run = record(msgspec.structs.replace(config, sim=msgspec.structs.replace(config.sim, motion="sines")))
+    assert run.manifest.quality.imu_clipped == 0
 
 
 def test_a_silent_reset_is_told_and_nothing_after_it_is_believed(tmp_path: Path) -> None:

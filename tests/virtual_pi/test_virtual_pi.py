@@ -23,6 +23,16 @@ def test_inside(guest, name):
     assert re.search(r"\d+ passed", done.stdout), done.stdout
 
 
+def test_the_contract_suite_on_the_emulated_bus(guest, tmp_path):
+    config = tmp_path / "bricktrackd.toml"
+    config.write_text('backend = "hardware"\n[[imu]]\nname = "brick"\nbus = "/dev/i2c-1"\n')
+    suite = str(HERE.parent / "contract/test_rig_contract.py")
+    arguments = ["-m", "pytest", "-q", "-p", "no:cacheprovider", suite, "-k", "hardware and I2cBus"]
+    done = guest([*arguments, "--rig", str(config)], options=["--share", str(tmp_path)])
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    assert re.search(r"\d+ passed", done.stdout), done.stdout
+
+
 @pytest.mark.skipif(not Path("/lib/systemd/systemd").exists(), reason="needs systemd, to boot it in there")
 def test_the_service_under_a_real_systemd(guest):
     arguments = [

@@ -5,17 +5,19 @@ import numpy as np
 import pytest
 from device_fakes import FakeRig
 
+from bricktrack_device.backends import open_rig
 from bricktrack_device.config import DeviceConfig, RecordingTable, SamplerTable, StorageTable
 from bricktrack_device.hardware.yuv import split_i420
 from bricktrack_device.health import machine, storage
 from bricktrack_device.health.blobs import channel_levels, find_blobs
-from bricktrack_device.health.camera import judge_still
+from bricktrack_device.health.camera import check_camera, judge_still
 from bricktrack_device.health.findings import CheckResult, worst
 from bricktrack_device.health.inertial import check_adapter
 from bricktrack_device.health.report import as_report
 from bricktrack_device.health.trigger_line import judge_wave
 from bricktrack_device.health.watch import HealthWatch
 from bricktrack_device.interfaces import Still
+from bricktrack_device.sim.settings import SimSettings
 
 CONFIG = DeviceConfig()
 
@@ -241,3 +243,18 @@ def test_a_warning_does_not_fail_the_whole_check() -> None:
     report = as_report("unit", lines, simulated=True)
     assert report.ok and report.level == "warn" and worst([]) == "ok"
     assert not as_report("u", [CheckResult(name="c", level="fail", detail="z")], simulated=True).ok
+
+
+@pytest.mark.parametrize(
+    ("led_level", "level", "words"), [(0.7, "ok", "0 % of their pixels"), (4.0, "warn", "saturated")]
+)
+def test_saturated_leds_of_a_simulated_unit_are_told_by_its_check(
+    led_level: float, level: str, words: str
+) -> None:
+    config = DeviceConfig(backend="sim", sim=SimSettings(led_level=led_level))
+    rig = open_rig(config)
+    try:
+        found = {r.name: r for r in check_camera(config, rig, stream_s=0.5)}
+    finally:
+        rig.close()
+    assert found["exposure"].level == level and words in found["exposure"].detail

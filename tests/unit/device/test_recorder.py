@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 
+from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Armed, Disarmed, Refusal, Reply
 from bricktrack_device import recorder as recorder_module
@@ -319,3 +320,59 @@ def test_a_line_stuck_high_leaves_the_unit_armed_and_the_status_says_why(
     b.wait_for("recording")
     b.wait_for("idle")
     assert b.recorder.status().reason == ""
+
+
+def test_a_unit_that_arms_itself_leaves_an_armed_state_that_lost_its_camera(
+    bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "_RETRY_S", 0.05)
+    camera = FakeCamera(silent_after=20)
+    recording = RecordingTable(duration_s=0.5, pre_roll_s=0.2, post_roll_s=0.1, auto_arm=True)
+    b = bench(rig=FakeRig(camera=camera), recording=recording, imu=[ImuTable(name="brick", bus="a")])
+    b.wait_for("armed")
+    b.wait_for("fault")
+    assert "lost while armed: camera: no picture" in b.recorder.status().last_error
+    camera.silent_after = None  # as a camera that works again once it is started anew
+    b.wait_for("armed")
+    b.rig.pulse(3)
+    b.wait_for("recording")
+    wait_until(lambda: b.store.count_runs() == 1)
+    assert b.store.list_runs()[0].state == "complete"
+
+
+def test_a_unit_that_a_host_armed_stays_armed_without_its_camera_and_says_so(
+    bench: Callable[..., Bench],
+) -> None:
+    b = bench(rig=FakeRig(camera=FakeCamera(silent_after=20)), imu=[ImuTable(name="brick", bus="a")])
+    b.arm()
+    wait_until(lambda: "camera: no picture" in b.recorder.status().reason)
+    assert b.recorder.state == "armed"
+
+
+def test_a_camera_that_does_not_stop_asks_for_a_new_start_once_nothing_is_under_way(
+    bench: Callable[..., Bench], tmp_path: Path
+) -> None:
+    camera = FakeCamera()
+    camera.stop_error = HardwareError("camera: it did not stop within 4.5 s")
+    b = bench(rig=FakeRig(camera=camera))
+    b.arm()
+    assert b.recorder.restart_reason == ""
+    b.rig.pulse(3)
+    b.wait_for("recording")
+    b.wait_for("idle")
+    assert b.recorder.restart_reason == "camera: it did not stop within 4.5 s"
+    assert b.store.list_runs()[0].state == "complete"
+
+
+def test_what_the_camera_itself_says_is_wrong_stands_in_the_run(
+    bench: Callable[..., Bench], tmp_path: Path
+) -> None:
+    camera = FakeCamera()
+    b = bench(rig=FakeRig(camera=camera))
+    run_id = b.arm().run_id
+    camera.trouble = "camera: 3 frames were lost on the way: disk"
+    b.rig.pulse(3)
+    b.wait_for("recording")
+    b.wait_for("idle")
+    missing = read_run(tmp_path / "runs" / run_id).manifest.missing
+    assert [m for m in missing if m.startswith(camera.trouble)] and len(missing) == 1
