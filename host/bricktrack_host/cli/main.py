@@ -14,6 +14,7 @@ from bricktrack_host.cli import (
     find,
     fleet,
     import_cmd,
+    keys,
     process,
     status,
     still,
@@ -61,6 +62,7 @@ app.command("disarm")(fleet.disarm)
 app.command("still")(still.still)
 app.command("configure")(configure.configure)
 app.command("delete")(delete.delete)
+app.add_typer(keys.app, name="keys")
 app.command("pull")(make_pull_command(process.process_pulled))
 app.command("import")(import_cmd.import_recording)
 app.command("target")(target.target)
