@@ -8,9 +8,7 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.calibration.calibration_file import Calibration, require_match
 from bricktrack_host.calibration.pixel_polynomials import picture_grid
-
-INSIDE_95 = 5.991
-"""95 % of the squares of two unit normal numbers sum to less."""
+from bricktrack_host.calibration.ray_uncertainty import CHI_95
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +60,7 @@ def compare_calibrations(now: Calibration, earlier: Calibration) -> CalibrationC
     a, b = new.plane_a_mm, new.plane_b_mm
     points = {z: old.points_on_plane(uv, z) for z in (a, b)}
     slopes = (points[b] - points[a]) / (b - a)
-    # Moving the earlier camera by (t, w) moves its rays' points on plane z by t + w x p, less the part along z.
+    # Moving the earlier camera by (t, w) moves its rays' points on z by t + w x p, less the part along z.
     rows, wanted = [], []
     for z, xy in points.items():
         p = np.column_stack([xy, np.full(len(xy), z)])
@@ -87,5 +85,5 @@ def compare_calibrations(now: Calibration, earlier: Calibration) -> CalibrationC
         shift_mm=solution[:3],
         turn_rad=solution[3:],
         left_mm=left,
-        explained_share=float(np.mean(squares < INSIDE_95)),
+        explained_share=float(np.mean(squares < CHI_95**2)),
     )

@@ -40,7 +40,8 @@ class RigTolerance:
 
     def __post_init__(self) -> None:
         for name in ("shift_mm", "turn_rad", "bend_mm"):
-            value = getattr(self, name)
+            value = float(getattr(self, name))
+            object.__setattr__(self, name, value)
             if not 0 <= value < np.inf:
                 raise CalibrationError(f"rig tolerance {name} = {value:g}: expected 0 (exact) or more")
 

@@ -70,7 +70,33 @@ def fit(
         ),
     ] = "auto",
     order: Annotated[
-        int | None, typer.Option(min=1, max=15, help="Order of the polynomials; cross-validated by default.")
+        str | None,
+        typer.Option(
+            help="Order of the polynomials, 1 to 15; 'cross-validated'; or 'held', where the dots hold high "
+            "degrees. \\[default: held; 5 for two-plane, as in the paper]",
+            metavar="ORDER",
+        ),
+    ] = None,
+    shift_tolerance_mm: Annotated[
+        float, typer.Option(min=0, help="How well the planes' places are known, one standard deviation.")
+    ] = 0.0,
+    turn_tolerance_deg: Annotated[
+        float, typer.Option(min=0, help="How well the far planes are parallel to the near one, likewise.")
+    ] = 0.0,
+    bend_tolerance_mm: Annotated[
+        float, typer.Option(min=0, help="How flat the board is at its farthest dot, likewise.")
+    ] = 0.0,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Write a page beside the calibration, as HTML.")
+    ] = True,
+    figures: Annotated[
+        Path | None, typer.Option(help="Folder that gets the page's figures as PNG.", metavar="FOLDER")
+    ] = None,
+    layout: Annotated[
+        Path | None, typer.Option("--layout", "-l", help="Layout file: its LEDs are drawn into the maps.")
+    ] = None,
+    earlier: Annotated[
+        Path | None, typer.Option(help="Earlier calibration of this unit, to be compared with.")
     ] = None,
     sensor_mode: Annotated[
         Path | None,
@@ -78,7 +104,7 @@ def fit(
     ] = None,
     focus_note: Annotated[str, typer.Option(help="How the lens is focused, for the record.")] = "",
 ) -> None:
-    """Fit a camera's rays to pictures of a dot target at two depths or more.
+    """Fit a camera's rays to pictures of a dot target at two depths or more, and report how good they are.
 
     For example:
 
@@ -87,7 +113,8 @@ def fit(
         bricktrack calibrate fit --board target.toml --picture 101.117=near.png --picture 161.111=far.png
         --unit b1 -o b1.json
 
-        bricktrack calibrate fit --rig rig.toml --target 32x18 --unit b1 -o b1.json
+        bricktrack calibrate fit --rig rig.toml --target 32x18 --unit b1 -o b1.json --layout brick.toml
+        --earlier b1-last-year.json
 
         bricktrack calibrate fit --plane-a near.png --a-mm 101.117 --plane-b far.png --b-mm 161.111
         --pitch-mm 4 --columns 32 --rows 18 --origin-near 960 540 --unit b1 -o b1.json
@@ -95,7 +122,7 @@ def fit(
     # With OpenCV and SciPy behind it: not for `--help`.
     from bricktrack_common.camera_model import SensorMode
     from bricktrack_host.calibration.dot_grid import GridOrigin
-    from bricktrack_host.cli._calibration_fit import run_fit
+    from bricktrack_host.cli._calibration_fit import FitOptions, order_wish, run_fit
     from bricktrack_host.cli._calibration_inputs import (
         FitJob,
         default_mode,
@@ -162,4 +189,15 @@ def fit(
     if name is None:
         raise ConfigError("--unit not given; a calibration belongs to one brick unit's camera")
     mode = load_toml(sensor_mode, SensorMode) if sensor_mode is not None else default_mode(job)
-    run_fit(job, mode=mode, model=model, order=order, unit=name, focus_note=focus_note, output=output)
+    options = FitOptions(
+        model=model,
+        order=order_wish(order),
+        shift_tolerance_mm=shift_tolerance_mm,
+        turn_tolerance_deg=turn_tolerance_deg,
+        bend_tolerance_mm=bend_tolerance_mm,
+        report=report,
+        figures=figures,
+        layout=layout,
+        earlier=earlier,
+    )
+    run_fit(job, options, mode=mode, unit=name, focus_note=focus_note, output=output)

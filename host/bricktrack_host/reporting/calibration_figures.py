@@ -15,14 +15,12 @@ from bricktrack_host.calibration.calibration_comparison import CalibrationCompar
 from bricktrack_host.calibration.dot_data import Planes
 from bricktrack_host.calibration.picture_region import ConvexRegion
 from bricktrack_host.calibration.pixel_polynomials import picture_grid
-from bricktrack_host.calibration.ray_uncertainty import UncertainRays
+from bricktrack_host.calibration.ray_uncertainty import CHI_95, UncertainRays
 from bricktrack_host.reporting.figure_layout import WIDTH_IN, panel_grid, picture_axes
 from bricktrack_host.reporting.plots import FUSED, IMPACT, INK, OPTICAL, TRUTH
 
 COLOURS = "viridis"
 _COLOUR_BAR_IN = 0.78
-CHI_95 = float(np.sqrt(5.991))
-"""Half-axis of the 95 % ellipse of two normal numbers, in standard deviations."""
 LONGEST_SIDE = 4.0
 """Triangles between dots with a longer side, in dot distances, span a gap: nothing is drawn in them."""
 

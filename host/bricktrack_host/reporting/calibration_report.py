@@ -17,7 +17,7 @@ from bricktrack_host.calibration.led_region import led_pixels, led_region
 from bricktrack_host.calibration.picture_region import ConvexRegion
 from bricktrack_host.calibration.pixel_polynomials import picture_grid
 from bricktrack_host.calibration.ray_calibration import RayCalibration
-from bricktrack_host.reporting.calibration_figures import CHI_95
+from bricktrack_host.calibration.ray_uncertainty import CHI_95
 from bricktrack_host.reporting.calibration_sections import CalibrationEvidence, calibration_sections
 from bricktrack_host.reporting.plots import style
 
@@ -41,7 +41,7 @@ class _OriginTable:
 
 
 def write_calibration_report(
-    path: Path,
+    path: Path | None,
     fitted: RayCalibration,
     calibration: Calibration,
     *,
@@ -53,7 +53,8 @@ def write_calibration_report(
 
     Parameters
     ----------
-    path : Path
+    path : Path or None
+        Of the page; None writes the figures alone.
     fitted : RayCalibration
     calibration : Calibration
         What was saved of it.
@@ -76,7 +77,8 @@ def write_calibration_report(
         sections, figures = calibration_sections(evidence)
         html = _rendered(evidence, sections)
         try:
-            path.write_text(html, encoding="utf-8")
+            if path is not None:
+                path.write_text(html, encoding="utf-8")
             if pictures_dir is not None:
                 _save_pictures(pictures_dir, figures)
         except OSError as e:

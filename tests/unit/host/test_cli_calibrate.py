@@ -37,6 +37,10 @@ def fitted(tmp_path_factory):
         "sample",
         "--focus-note",
         "f/2",
+        "--layout",
+        SAMPLE / "layout.toml",
+        "--figures",
+        path.parent / "figures",
         "-o",
         path,
     )
@@ -64,13 +68,55 @@ def test_the_sample_is_calibrated_and_reported(fitted):
         assert words in output
 
 
+def test_the_page_stands_alone_and_says_simulated(fitted):
+    path, output = fitted
+    page = path.with_suffix(".html").read_text()
+    assert "Report written to" in output
+    assert "SIMULATED" in page and "Calibration of sample" in page
+    assert "http" not in page.replace("http://www.w3.org", "")  # nothing is fetched
+    assert page.count("data:image/svg+xml") == 6
+    for words in (
+        "Residuals on the planes",
+        "Coverage",
+        "Uncertainty of the rays",
+        "of the places where the",
+    ):
+        assert words in page
+    pictures = {p.stem: cv2.imread(str(p)) for p in (path.parent / "figures").glob("*.png")}
+    assert set(pictures) == {
+        *("residual-contours", "residual-surfaces", "residual-arrows", "left-out-errors"),
+        *("coverage", "uncertainty"),
+    }
+    assert all(p is not None and p.std() > 10 for p in pictures.values())  # none is blank
+
+
+def test_an_earlier_calibration_of_another_unit_is_refused_before_the_work(fitted, tmp_path):
+    with pytest.raises(CalibrationError, match="of unit 'sample', the recording of unit 'other'"):
+        fit(
+            "--rig", SAMPLE / "rig.toml", "--target", "32x18", "--unit", "other", "-o", tmp_path / "o.json",
+            "--earlier", fitted[0],
+        )  # fmt: skip
+    assert not (tmp_path / "o.json").exists()
+
+
+@pytest.mark.parametrize("order", ["0", "16", "five", "-1"])
+def test_an_order_that_is_none_is_refused(tmp_path, order):
+    with pytest.raises(
+        ConfigError, match="expected a whole number from 1 to 15, 'held' or 'cross-validated'"
+    ):
+        fit(
+            "--rig", SAMPLE / "rig.toml", "--target", "32x18", "--unit", "s", "-o", tmp_path / "o.json",
+            f"--order={order}",
+        )  # fmt: skip
+
+
 def test_the_flags_say_the_same_as_the_rig_file(fitted, tmp_path):
     path = tmp_path / "flags.json"
     result = fit(
         "--plane-a", SAMPLE / "calib_A_32x18.png", "--a-mm", 101.117,
         "--plane-b", SAMPLE / "calib_B_32x18.png", "--b-mm", 161.111,
         "--pitch-mm", 4, "--columns", 32, "--rows", 18, "--origin-near", 960, 540, "--dot-diameter-mm", 2,
-        "--unit", "sample", "-o", path,
+        "--unit", "sample", "-o", path, "--no-report",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert load_calibration(path).rays == load_calibration(fitted[0]).rays
@@ -79,11 +125,22 @@ def test_the_flags_say_the_same_as_the_rig_file(fitted, tmp_path):
 def test_two_planes_can_be_asked_for(tmp_path):
     path = tmp_path / "two.json"
     result = fit(
-        "--rig", SAMPLE / "rig.toml", "--target", "32x18", "--unit", "s", "-o", path, "--model", "two-plane"
+        "--rig",
+        SAMPLE / "rig.toml",
+        "--target",
+        "32x18",
+        "--unit",
+        "s",
+        "-o",
+        path,
+        "--model",
+        "two-plane",
+        "--no-report",
     )
     assert result.exit_code == 0, result.output
     assert load_calibration(path).choice.model == "two-plane"
     assert load_calibration(path).choice.order == 5
+    assert not path.with_suffix(".html").exists()
     assert "Warning: rays outside are extrapolated" in result.output  # at B dots fill half of the picture
 
 
