@@ -57,6 +57,11 @@ class ChosenUnits:
     fleet: Fleet | None
 
 
+def fleet_path(fleet_file: Path | None) -> Path:
+    """Return the fleet file that is meant: the one given, the environment's, or the one at hand."""
+    return fleet_file or Path(os.environ.get("BRICKTRACK_FLEET") or DEFAULT_FLEET)
+
+
 def choose_units(
     fleet_file: Path | None, names: list[str] | None, addresses: list[str] | None, *, timeout_s: float
 ) -> ChosenUnits:
@@ -71,7 +76,7 @@ def choose_units(
         if names or fleet_file:
             raise ConfigError("--address stands for itself: give it without --unit and --fleet")
         return ChosenUnits([unit_at(a) for a in dict.fromkeys(addresses)], Dialer(timeout_s=timeout_s), None)
-    path = fleet_file or Path(os.environ.get("BRICKTRACK_FLEET") or DEFAULT_FLEET)
+    path = fleet_path(fleet_file)
     if fleet_file is None and not path.exists():
         raise ConfigError(
             f"no fleet file {path}. Name the unit with --address tcp://host:port, or write a fleet.toml "

@@ -1,7 +1,5 @@
 """``bricktrack find``: the units that announce themselves in this network."""
 
-import os
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,7 +9,7 @@ from bricktrack_common.key_files import fingerprint
 from bricktrack_common.wire_messages import PROTOCOL_VERSION
 from bricktrack_host.cli._console import err, out, plain, print_json, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
-from bricktrack_host.cli._units import DEFAULT_FLEET, FleetOption, JsonOption
+from bricktrack_host.cli._units import FleetOption, JsonOption, fleet_path
 from bricktrack_host.transfer.discovery import SEARCH_S, FoundUnit, NetworkFinder
 from bricktrack_host.transfer.fleet_config import Fleet, load_fleet
 
@@ -33,7 +31,7 @@ def find(
 
         bricktrack find --fleet fleet.toml --json
     """
-    path = fleet or Path(os.environ.get("BRICKTRACK_FLEET") or DEFAULT_FLEET)
+    path = fleet_path(fleet)
     known = load_fleet(path) if fleet is not None or path.exists() else None
     finder = NetworkFinder(search_s=seconds)
     try:

@@ -1,6 +1,5 @@
 """``bricktrack keys``: who this host is, and which units it knows."""
 
-import os
 import re
 import socket
 import sys
@@ -15,7 +14,7 @@ from bricktrack_common.errors import BricktrackError, ConfigError
 from bricktrack_common.key_files import KeyPair, fingerprint, read_secret_key
 from bricktrack_host.cli._console import err, out, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
-from bricktrack_host.cli._units import DEFAULT_FLEET, FleetOption, JsonOption, TimeoutOption
+from bricktrack_host.cli._units import FleetOption, JsonOption, TimeoutOption, fleet_path
 from bricktrack_host.transfer.contact import Dialer
 from bricktrack_host.transfer.fleet_config import Fleet, UnitConfig, load_fleet
 from bricktrack_host.transfer.keys import (
@@ -94,7 +93,7 @@ def list_keys(file: FileOption = None, fleet: FleetOption = None, as_json: JsonO
 
         bricktrack keys list --json
     """
-    chosen = load_fleet(_fleet_path(fleet))
+    chosen = load_fleet(fleet_path(fleet))
     path = _key_path(file, chosen)
     own = read_secret_key(path).public if path.exists() else None
     if as_json:
@@ -143,7 +142,7 @@ def install(
 
         bricktrack keys install brick-01 --ssh pi@10.0.0.21
     """
-    path = _fleet_path(fleet)
+    path = fleet_path(fleet)
     chosen = load_fleet(path)
     if not chosen.host.secret_key:
         raise ConfigError(
@@ -186,7 +185,7 @@ def rotate(
 
         bricktrack keys rotate --ssh pi
     """
-    chosen = load_fleet(_fleet_path(fleet))
+    chosen = load_fleet(fleet_path(fleet))
     path = _key_path(file, chosen)
     old, new = read_secret_key(path), next_host_key(path, name=_host_name())
     keyed = [u for u in _selected(chosen, None, ssh) if u.server_key]
@@ -241,12 +240,8 @@ def _key_path(file: Path | None, fleet: Fleet | None) -> Path:
 
 
 def _fleet_if_any(fleet_file: Path | None) -> Fleet | None:
-    path = _fleet_path(fleet_file)
+    path = fleet_path(fleet_file)
     return load_fleet(path) if fleet_file is not None or path.exists() else None
-
-
-def _fleet_path(fleet_file: Path | None) -> Path:
-    return fleet_file or Path(os.environ.get("BRICKTRACK_FLEET") or DEFAULT_FLEET)
 
 
 def _key_name(pair: KeyPair) -> str:
