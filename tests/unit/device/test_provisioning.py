@@ -1,9 +1,11 @@
 """The playbook that makes units of many cards: its syntax, and the settings and keys that it gives each."""
 
+import json
 import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import jinja2
 import pytest
 import yaml
 
+from bricktrack_common.key_files import read_secret_key
 from bricktrack_device.config import DeviceConfig, load_config
 
 FOLDER = Path(__file__).resolve().parents[3] / "systemd/provisioning"
@@ -68,12 +71,34 @@ def test_everything_that_the_script_reads_is_copied() -> None:
     }
 
 
-def test_a_units_key_is_made_for_its_user_alone_and_its_public_half_beside_it(tmp_path: Path) -> None:
-    from bricktrack_common.key_files import read_public_key, read_secret_key
+def test_a_units_key_is_made_and_its_public_half_told_by_the_daemons_own_command(tmp_path: Path) -> None:
+    def run(name: str) -> str:
+        argv = tasks()[name]["ansible.builtin.command"]["argv"]
+        filled = [str(a).replace("{{ keys }}", str(tmp_path / "keys")) for a in argv[1:]]
+        return subprocess.run(
+            [sys.executable, "-m", "bricktrack_device.cli", *filled],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
 
-    argv = tasks()["The unit's own key, made there and never copied"]["ansible.builtin.command"]["argv"]
-    code = argv[argv.index("-c") + 1]
-    subprocess.run([sys.executable, "-c", code, str(tmp_path), "unit north-1"], check=True)
-    secret = tmp_path / "unit.key_secret"
+    run("The unit's own key, made there and never copied")
+    secret = tmp_path / "keys/unit.key_secret"
     assert secret.stat().st_mode & 0o777 == 0o600
-    assert read_secret_key(secret).public == read_public_key(tmp_path / "unit.key")
+    public = json.loads(run("The unit's public key"))["public"]
+    assert read_secret_key(secret).public == public
+    # Keys have braces and percent signs in them: they pass Jinja as a value, and TOML as a JSON string.
+    entry = tasks()["The public key here, as it belongs into the host's fleet.toml"]["ansible.builtin.copy"]
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined)
+    environment.filters |= {"from_json": json.loads, "to_json": json.dumps}
+    text = environment.from_string(entry["content"]).render(
+        inventory_hostname="north-1",
+        ansible_host="192.168.7.11",
+        shown={"stdout": json.dumps({"public": public})},
+    )
+    (unit,) = tomllib.loads(text)["unit"]
+    assert (unit["name"], unit["address"], unit["server_key"]) == (
+        "north-1",
+        "tcp://192.168.7.11:41733",
+        public,
+    )
