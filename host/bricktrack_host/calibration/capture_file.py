@@ -2,7 +2,7 @@
 
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -70,7 +70,7 @@ class Capture(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     sensor_mode: SensorMode
     picture: tuple[CapturedPicture, ...]
     origin_near_px: tuple[float, float] | None = None
-    origin_at: str = "centre"
+    origin_at: Literal["centre", "dot"] = "centre"
     simulated: bool = False
     version: Annotated[int, msgspec.Meta(ge=1)] = VERSION
 

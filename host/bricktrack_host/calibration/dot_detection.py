@@ -211,10 +211,11 @@ def _measure(light: Light, regions: Regions, polarity: Polarity) -> Dots:
         # Shapes of the small dots: what a large one would be at its place.
         shrink = np.where(ratio > np.sqrt(LARGE_AREA_RATIO), LARGE_AREA_RATIO, 1.0)
         spread = np.array([moments[k].spread_px2 for k in whole])
-        odd = have_odd_shapes(uv[whole], spread / shrink[:, None, None])
-        good[whole[odd]] = False
-        whole, shrink, spread = whole[~odd], shrink[~odd], spread[~odd]
+        # Blur adds its square to a disc's second moments, whatever its size.
         shape = 4 * (spread - blur**2 * np.eye(2)) / shrink[:, None, None]
+        odd = have_odd_shapes(uv[whole], shape)
+        good[whole[odd]] = False
+        whole, shape, shrink = whole[~odd], shape[~odd], shrink[~odd]
         sizes = (1.0, LARGE_AREA_RATIO) if np.any(shrink > 1) else (1.0,)
         near = Neighbours(middle[whole]).nearest(middle, 3)[1]
         for i in np.flatnonzero(good & touches):

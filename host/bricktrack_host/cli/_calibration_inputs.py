@@ -8,7 +8,7 @@ import msgspec
 from bricktrack_common.camera_model import IMX219_1080P, SensorMode
 from bricktrack_common.errors import CalibrationError, ConfigError
 from bricktrack_common.typed_data import load_toml
-from bricktrack_host.calibration.capture_file import CAPTURE_FILE, load_capture
+from bricktrack_host.calibration.capture_file import CAPTURE_FILE, Capture, load_capture
 from bricktrack_host.calibration.dot_detection import Polarity
 from bricktrack_host.calibration.dot_grid import GridOrigin
 from bricktrack_host.calibration.plane_pictures import PlanePicture, observe_pictures
@@ -132,21 +132,23 @@ def job_of_capture(folder: Path) -> FitJob:
     capture = load_capture(folder)
     if not capture.picture:
         raise CalibrationError(f"{folder / CAPTURE_FILE}: no pictures yet; take them with calibrate capture")
-    origin = (
-        None
-        if capture.origin_near_px is None
-        else GridOrigin(capture.origin_near_px, "dot" if capture.origin_at == "dot" else "centre")
-    )
     return FitJob(
         pictures=tuple((p.z_mm, folder / p.file) for p in capture.picture),
         target=capture.target,
-        origin=origin,
+        origin=origin_of(capture),
         polarity=capture.target.polarity,
         dot_diameter_mm=capture.target.diameter_mm,
         unit=capture.unit,
         mode=capture.sensor_mode,
         simulated=capture.simulated,
     )
+
+
+def origin_of(capture: Capture) -> GridOrigin | None:
+    """Return the origin that was nominated for captured pictures of a plain target."""
+    if capture.origin_near_px is None:
+        return None
+    return GridOrigin(capture.origin_near_px, capture.origin_at)
 
 
 def job_of_pictures(board: Path, pictures: list[str], origin: GridOrigin | None) -> FitJob:

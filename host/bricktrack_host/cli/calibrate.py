@@ -8,6 +8,7 @@ import typer
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.typed_data import load_toml
+from bricktrack_host.cli import calibrate_capture
 
 app = typer.Typer(help="Calibrate cameras from pictures of dot targets.", no_args_is_help=True)
 
@@ -201,3 +202,6 @@ def fit(
         earlier=earlier,
     )
     run_fit(job, options, mode=mode, unit=name, focus_note=focus_note, output=output)
+
+
+app.command("capture")(calibrate_capture.capture)

@@ -45,6 +45,9 @@ def test_every_dot_placed_has_its_own_place(pose, faults):
     assert wrong == 0
     # Dots under a reflection are lost, and those whose blurred rim reaches the border; no more.
     assert right > 0.85 * np.count_nonzero(picture.whole)
+    # ... large and small alike.
+    large = TARGET.large_dots()[dots.column_row[:, 1], dots.column_row[:, 0]]
+    assert 0.18 < large.mean() < 0.32
     # A board tilted to the optical axis looks turned by a little more or less.
     assert abs((board_turn_deg(dots) - pose.turn_deg + 180) % 360 - 180) < 4.0
 
