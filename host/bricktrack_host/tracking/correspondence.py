@@ -13,7 +13,7 @@ from itertools import combinations, permutations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
@@ -32,7 +32,8 @@ from bricktrack_host.tracking.verification import (
 )
 
 _MAX_SEARCH_BLOBS = 12
-_RIVAL_CHI2 = 12.0
+_RIVAL_EVIDENCE = 9.0  # three sigma
+_USUAL_SD_PX, _USUAL_WEIGHT = 1.0, 4.0  # of residuals, before any were seen; worth so many of them
 
 
 def assign_predicted(
@@ -130,17 +131,35 @@ def search_correspondence(
     n_kept = (kept >= 0).sum(axis=1)
     if n_kept.max(initial=0) < MIN_INLIERS:
         return no_correspondence(n_leds, "no pose explains four LEDs within the gate")
-    order = np.lexsort((poses.chi2, -n_kept))
+    mode = ray_model.sensor_mode
+    evidence = _evidence(poses.residual_px, kept >= 0, mode.width * mode.height)
+    order = np.argsort(-evidence, kind="stable")
     best = int(order[0])
     for i in order[1:]:
-        if n_kept[i] < n_kept[best] or not poses.chi2[i] <= poses.chi2[best] + _RIVAL_CHI2:
-            continue
+        if not evidence[i] > evidence[best] - _RIVAL_EVIDENCE:
+            break
+        both = (kept[i] >= 0) & (kept[best] >= 0)
         turn = np.trace(poses.R_camera_brick[i].T @ poses.R_camera_brick[best])
-        if (kept[i] != kept[best]).any() or turn < 1 + 2 * np.cos(np.radians(2.0)):
+        if (kept[i] != kept[best])[both].any() or turn < 1 + 2 * np.cos(np.radians(2.0)):
             return no_correspondence(n_leds, "two assignments fit equally well", ambiguous=True)
     answer = kept[best].copy()
     answer[answer >= 0] = original[answer[answer >= 0]]
     return verified_correspondence(answer, poses, best)
+
+
+def _evidence(residual_px: FloatArray, kept: BoolArray, n_pixels: int) -> FloatArray:
+    """Return twice the log likelihood ratio of assignments, shape (n,), to blobs that fell anywhere.
+
+    A blob that is its LED lies within its residuals' scatter, which each assignment shows itself (a rolling
+    shutter or an unfitted profile leaves several pixels); one that is not lies anywhere in the picture. So a
+    sixth LED found at eight pixels does not outweigh that the five others then miss their blobs as well.
+    """
+    n_leds = kept.sum(axis=1)
+    squares = np.where(kept, np.nan_to_num(residual_px**2).sum(axis=-1), 0.0).sum(axis=1)
+    freedom = np.maximum(2 * n_leds - 6, 0)
+    variance = (squares + _USUAL_WEIGHT * _USUAL_SD_PX**2) / (freedom + _USUAL_WEIGHT)
+    evidence = 2 * n_leds * np.log(n_pixels / (2 * np.pi * variance)) - squares / variance
+    return np.where(n_leds >= MIN_INLIERS, evidence, -np.inf)
 
 
 def _likeliest(blobs: Blobs) -> tuple[Blobs, IntArray]:
