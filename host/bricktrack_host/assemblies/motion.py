@@ -87,23 +87,14 @@ class Motion:
         jacobian[:, 3:, 3:] = S
         return Motion(moved.R, moved.t_mm, _through(jacobian, self.covariance), self.flags)
 
-    def displacement_of(self, point_mm: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return how far a point of the component has moved from rest, and its covariance.
+    def about(self, point_mm: ArrayLike) -> "Motion":
+        """Return the same motion with another point as origin: `t_mm` is then the displacement of that point.
 
         Parameters
         ----------
         point_mm : array_like, shape (3,), mm, brick axes, at rest
-
-        Returns
-        -------
-        displacement_mm : ndarray, shape (n, 3), mm, brick axes of the component it is seen from
-        covariance_mm2 : ndarray, shape (n, 3, 3), mm^2
         """
-        p_mm = as_float_array("point_mm", point_mm, (3,))
-        jacobian = np.zeros((len(self.R), 3, 6))
-        jacobian[:, :, :3] = -self.R @ skew(p_mm)
-        jacobian[:, :, 3:] = np.eye(3)
-        return Pose(self.R, self.t_mm).apply(p_mm) - p_mm, _through(jacobian, self.covariance)
+        return self.in_axes(Pose(np.eye(3), -as_float_array("point_mm", point_mm, (3,))))
 
 
 def disagreement(one: Motion, other: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -8,9 +8,11 @@ import typer
 from bricktrack_host.cli import (
     calibrate,
     calibrate_leds,
+    combine,
     configure,
     delete,
     demo,
+    export,
     find,
     fleet,
     import_cmd,
@@ -70,6 +72,8 @@ calibrate.app.command("leds")(calibrate_leds.leds)
 app.add_typer(calibrate.app, name="calibrate")
 app.command("process")(process.process)
 app.command("report")(process.report)
+app.command("combine")(combine.combine)
+app.command("export")(export.export)
 app.command("demo")(demo.demo)
 
 

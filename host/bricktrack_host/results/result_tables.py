@@ -237,8 +237,6 @@ def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest:
         d_cov = rest.R_camera_rest.T @ covariance[:, 3:, 3:] @ rest.R_camera_rest
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     d_sd = np.sqrt(np.diagonal(d_cov, axis1=1, axis2=2))
-    triangle = covariance[:, _TRIANGLE[0], _TRIANGLE[1]]
-    packed = pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(triangle).reshape(-1)), 21)
     return [
         *vector_columns("{}_mm", "mm", "position of the first LED, camera frame", t_mm),
         *(
@@ -265,8 +263,15 @@ def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest:
         *vector_columns(
             "sd_rot_{}_deg", "deg", "standard deviation of the rotation, brick axes", np.rad2deg(sd[:, :3])
         ),
-        (Column("covariance", "rad, mm", "see the table's conventions; left out of the CSV"), packed),
+        covariance_column(covariance),
     ]
+
+
+def covariance_column(covariance: FloatArray) -> tuple[Column, "pa.Array[Any]"]:
+    """Return the upper triangles of covariances, shape (n, 6, 6), as one column of lists."""
+    triangle = np.ascontiguousarray(covariance[:, _TRIANGLE[0], _TRIANGLE[1]])
+    packed = pa.FixedSizeListArray.from_arrays(pa.array(triangle.reshape(-1)), 21)
+    return Column("covariance", "rad, mm", "see the table's conventions; left out of the CSV"), packed
 
 
 def vector_columns(name: str, unit: str, meaning: str, values: FloatArray) -> Columns:

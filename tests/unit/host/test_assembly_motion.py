@@ -112,8 +112,8 @@ def test_a_quarter_turn_about_a_far_point_is_what_paper_and_pencil_say(blank):
     )
     [b] = assembly_motion(config, {"u1": result}).components
     np.testing.assert_allclose(b.motion.t_mm[1], [0, 0, 0], atol=1e-12)
-    displacement, _ = b.motion.displacement_of(config.component[1].point_mm)
-    np.testing.assert_allclose(displacement[1], [-50, 50, 0], atol=1e-12)
+    moved_point = b.motion.about(config.component[1].point_mm)
+    np.testing.assert_allclose(moved_point.t_mm[1], [-50, 50, 0], atol=1e-12)
 
 
 def test_a_chain_gives_each_component_in_the_axes_of_the_base(blank):
@@ -199,9 +199,8 @@ def test_covariances_are_those_of_a_thousand_noisy_runs(blank):
     # of rotations of some milliradians over 50 mm is far below it.
     assert normalised.mean() == pytest.approx(6, abs=0.25)
     point = [10.0, -20.0, 30.0]
-    at, covariance = seen.displacement_of(point)
-    true_at, _ = true.displacement_of(point)
-    off = true_at - at
+    off = true.about(point).t_mm - seen.about(point).t_mm
+    covariance = true.about(point).covariance[:, 3:, 3:]
     assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off).mean() == pytest.approx(3, abs=0.2)
     _, _, apart = disagreement(as_motion(noisy(first, sd)), as_motion(noisy(first, sd)))
     assert apart.mean() == pytest.approx(6, abs=0.25)
