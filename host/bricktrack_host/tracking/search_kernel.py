@@ -5,10 +5,15 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
-from bricktrack_common.arrays import FloatArray
+from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.compiled import compiled
+from bricktrack_host.quality import LedFlag
 from bricktrack_host.tracking.light_kernel import (
     AREA,
+    BOX_HEIGHT,
+    BOX_U,
+    ECCENTRICITY,
+    FILL,
     MIN_CONTRAST,
     Bytes,
     U,
@@ -24,6 +29,9 @@ brightness, and a lamp or a reflection may outshine them."""
 _MAX_CANDIDATES = 40
 _MIN_BOX_SHARE = 0.45
 _SAME_PX = 2.0
+_MIN_FILL = 0.90  # a disc behind a straight edge keeps 0.93 and more; rings, arcs and pairs have less
+_MAX_ECCENTRICITY = 0.87  # a hemisphere seen from the side: half a disc, 0.85
+_BORDER, _MERGED, _PARTLY_COVERED = int(LedFlag.BORDER), int(LedFlag.MERGED), int(LedFlag.PARTLY_COVERED)
 _DARK, _LIT, _OWN, _DONE = 0, 1, 2, 3
 Owners = NDArray[np.int16]
 
@@ -38,8 +46,15 @@ def find_lights(
     smallest_px: float,
     largest_px: float,
     linear: FloatArray,
-) -> FloatArray:
-    """Search a picture and measure what is found, shape (n, `light_kernel.N_FIELDS`), each light once."""
+) -> tuple[FloatArray, IntArray]:
+    """Search a picture and measure what is found, each light once.
+
+    Returns
+    -------
+    lights : ndarray, shape (n, `light_kernel.N_FIELDS`)
+    flags : ndarray, shape (n,)
+        `LedFlag`: BORDER, MERGED, PARTLY_COVERED as far as the shape alone tells.
+    """
     places, half_sizes = search_picture(luma, stride, rows, columns, step, smallest_px, largest_px, linear)
     lights = measure_windows(luma, stride, rows, columns, places, half_sizes, linear)
     n = 0
@@ -51,7 +66,8 @@ def find_lights(
         if is_new:
             lights[n] = lights[k]
             n += 1
-    return lights[:n].copy()
+    lights = lights[:n].copy()
+    return lights, _shape_flags(lights, rows, columns)
 
 
 @compiled
@@ -85,7 +101,7 @@ def search_picture(
             small[j, i] = code
             brightest = max(brightest, code)
     places, half_sizes = np.empty((_MAX_CANDIDATES, 2)), np.empty((_MAX_CANDIDATES, 2))
-    background = linear[int(np.median(small[::3, ::3]))]
+    background = linear[_median_code(small[::3, ::3])]
     contrast = linear[brightest] - background
     n = 0
     if contrast < MIN_CONTRAST:
@@ -120,6 +136,48 @@ def search_picture(
                     places[known] = first + step * mean_x, first + step * mean_y
                     half_sizes[known] = 0.5 * step * w, 0.5 * step * h
     return places[:n].copy(), half_sizes[:n].copy()
+
+
+@compiled
+def _shape_flags(lights: FloatArray, rows: int, columns: int) -> IntArray:
+    flags = np.zeros(len(lights), dtype=np.int64)
+    areas = lights[:, AREA]
+    good = np.zeros(len(lights), dtype=np.bool_)
+    for k in range(len(lights)):
+        u0, v0, width, height = lights[k, BOX_U : BOX_HEIGHT + 1]
+        if u0 <= 0 or v0 <= 0 or u0 + width >= columns or v0 + height >= rows:
+            flags[k] = _BORDER
+        good[k] = flags[k] == 0 and not _is_odd(lights[k])
+    if not len(lights):
+        return flags
+    usual = np.median(areas[good]) if good.any() else np.median(areas)
+    for k in range(len(lights)):
+        large, is_odd = areas[k] > 1.3 * usual, _is_odd(lights[k])
+        # Foreshortened domes are small and elongated, near ones large and round: large and elongated are two.
+        is_pair = areas[k] > 1.4 * usual and lights[k, ECCENTRICITY] > 0.7
+        if is_pair or (is_odd and large):
+            flags[k] |= _MERGED
+        if is_odd and not large:
+            flags[k] |= _PARTLY_COVERED
+    return flags
+
+
+@compiled
+def _is_odd(light: FloatArray) -> bool:
+    return bool(light[FILL] < _MIN_FILL or light[ECCENTRICITY] > _MAX_ECCENTRICITY)
+
+
+@compiled
+def _median_code(codes: Bytes) -> int:
+    count = np.zeros(256, dtype=np.int64)
+    for j in range(codes.shape[0]):
+        for i in range(codes.shape[1]):
+            count[codes[j, i]] += 1
+    n, code = count[0], 0
+    while 2 * n < codes.size:
+        code += 1
+        n += count[code]
+    return code
 
 
 @compiled

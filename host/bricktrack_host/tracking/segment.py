@@ -13,15 +13,11 @@ from numpy.typing import NDArray
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import ShapeError
-from bricktrack_host.quality import LedFlag
 from bricktrack_host.tracking import light_kernel as k
 from bricktrack_host.tracking.centroids import flat_bytes, linear_light_of_luma
 from bricktrack_host.tracking.search_kernel import find_lights
 
 Plane = NDArray[np.uint8]
-
-_MIN_FILL = 0.90  # a disc behind a straight edge keeps 0.93 and more; rings, arcs and pairs have less
-_MAX_ECCENTRICITY = 0.87  # a hemisphere seen from the side: half a disc, 0.85
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,31 +97,15 @@ def find_blobs(picture: Picture, *, radius_px: float | None = None) -> Blobs:
     largest = rows / 8 if radius_px is None else 3 * radius_px
     step = min(max(int(smallest * 1.2), 1), 8)
     luma, stride = flat_bytes(picture.luma)
-    lights = find_lights(luma, stride, rows, columns, step, smallest, largest, linear_light_of_luma())
-    return _blobs_of(lights, rows, columns)
-
-
-def _blobs_of(lights: FloatArray, rows: int, columns: int) -> Blobs:
-    if not len(lights):
-        return _no_blobs()
-    areas, eccentricity, fill = lights[:, k.AREA], lights[:, k.ECCENTRICITY], lights[:, k.FILL]
-    u0, v0, width, height = lights[:, k.BOX_U : k.BOX_HEIGHT + 1].T
-    at_border = (u0 <= 0) | (v0 <= 0) | (u0 + width >= columns) | (v0 + height >= rows)
-    odd = (fill < _MIN_FILL) | (eccentricity > _MAX_ECCENTRICITY)
-    good = ~(odd | at_border)
-    usual = float(np.median(areas[good] if good.any() else areas))
-    # Foreshortened domes are small and elongated, near ones large and round: large and elongated are two.
-    pair = (areas > 1.4 * usual) & (eccentricity > 0.7)
-    merged, covered = (odd & (areas > 1.3 * usual)) | pair, odd & (areas <= 1.3 * usual)
+    linear = linear_light_of_luma()
+    lights, flags = find_lights(luma, stride, rows, columns, step, smallest, largest, linear)
     return Blobs(
         uv_px=lights[:, [k.U, k.V]],
         cov_px2=lights[:, [[k.COV_UU, k.COV_UV], [k.COV_UV, k.COV_VV]]],
-        area_px2=areas,
-        eccentricity=eccentricity,
-        fill=fill,
-        flags=at_border * int(LedFlag.BORDER)
-        | merged * int(LedFlag.MERGED)
-        | covered * int(LedFlag.PARTLY_COVERED),
+        area_px2=lights[:, k.AREA],
+        eccentricity=lights[:, k.ECCENTRICITY],
+        fill=lights[:, k.FILL],
+        flags=flags,
     )
 
 
