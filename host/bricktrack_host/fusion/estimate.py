@@ -7,7 +7,7 @@ one loop over time.
 import logging
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -16,15 +16,19 @@ from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ConfigError, ShapeError
+from bricktrack_host.fusion.camera_delay import settle_delay
 from bricktrack_host.fusion.fused_output import common_part, sample_motion
 from bricktrack_host.fusion.fusion_problem import NoiseLevel, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE, CameraImu, CameraMotion, align_both
 from bricktrack_host.fusion.pose_level import Smoothed, smooth_poses
 from bricktrack_host.fusion.smoother import BA, BG, GRAV, LAG, LOSS, SKEW, TAU, Estimate
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
 logger = logging.getLogger(__name__)
+
+CameraMotionKind = Literal["static", "imu", "table"]
 
 _RUNS_AT_ONCE = 1  # compiled loops gain nothing by more, and each run needs as many passes as it needs
 
@@ -102,7 +106,9 @@ class FusionInput:
     output_t_ns : ndarray of int64, shape (m,), camera time
         Where the motion is wanted, in any order.
     alignment : TimeAlignment, optional
-        Estimated by `align_times` when not given.
+        Estimated by `align_times` when not given; not where the camera moves, which has two to estimate.
+    camera : CameraImu, optional
+        The sensor that moves with the camera; none: the camera stands still.
     """
 
     optical: OpticalTrack
@@ -110,6 +116,7 @@ class FusionInput:
     lever_arm_mm: ArrayLike
     output_t_ns: IntArray
     alignment: TimeAlignment | None = None
+    camera: CameraImu | None = None
 
 
 def fuse(
@@ -119,7 +126,8 @@ def fuse(
     lever_arm_mm: ArrayLike,
     output_t_ns: IntArray,
     alignment: TimeAlignment | None = None,
-    camera: Literal["static"] = "static",
+    camera: CameraMotionKind = "static",
+    camera_imu: CameraImu | None = None,
     settings: FusionSettings | None = None,
     with_forward: bool = False,
 ) -> FusionResult:
@@ -136,8 +144,11 @@ def fuse(
         Where the motion is wanted, in any order.
     alignment : TimeAlignment, optional
         Estimated by `align_times` when not given.
-    camera : "static"
-        The camera stands still in an inertial frame.
+    camera : "static", "imu" or "table"
+        The camera stands still; moves with a sensor of its own; or moves with a table whose accelerometers
+        are recorded.
+    camera_imu : CameraImu, optional
+        That sensor, where the camera moves.
     settings : FusionSettings, optional
     with_forward : bool
         Whether to give the forward filter's motion too.
@@ -149,20 +160,39 @@ def fuse(
     Raises
     ------
     ConfigError
-        If the camera moves.
+        If the camera moves and there is no sensor with it: the position is then not observable.
     TrackingError
         If there is no optical pose.
     ShapeError
         If there are too few inertial samples, or arrays do not fit together.
     """
-    one = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment)
-    return fuse_batch([one], camera=camera, settings=settings, with_forward=with_forward)[0]
+    require_observable(camera, camera_imu)
+    one = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment, camera_imu)
+    return fuse_batch([one], settings=settings, with_forward=with_forward)[0]
+
+
+def require_observable(camera: CameraMotionKind, camera_imu: CameraImu | None) -> None:
+    """Refuse a configuration in which the position cannot be told, or which contradicts itself.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if camera not in ("static", "imu", "table"):
+        raise ConfigError(f"camera = {camera!r}: expected 'static', 'imu' or 'table'")
+    if camera != "static" and camera_imu is None:
+        raise ConfigError(
+            f"camera = {camera!r} without a sensor that moves with the camera. {NOT_OBSERVABLE}"
+        )
+    if camera_imu is not None and camera_imu.kind != camera:
+        raise ConfigError(
+            f"camera = {camera!r}, but the sensor given with the camera is of {camera_imu.kind!r}"
+        )
 
 
 def fuse_batch(
     inputs: Sequence[FusionInput],
     *,
-    camera: Literal["static"] = "static",
     settings: FusionSettings | None = None,
     with_forward: bool = False,
     executor: Executor | None = None,
@@ -171,12 +201,6 @@ def fuse_batch(
 
     ``executor``: any of `concurrent.futures`, as a pool of processes; the eights are shared out to it.
     """
-    if camera != "static":
-        raise ConfigError(
-            f"camera = {camera!r}: expected 'static'. When the camera moves, one IMU on the LED component "
-            "cannot tell the camera's acceleration from the brick's: the position is not observable. "
-            "Mount a second IMU with the camera, or smooth the optical poses alone (smooth_optical)."
-        )
     settings = settings or FusionSettings()
     batches = [inputs[i : i + _RUNS_AT_ONCE] for i in range(0, len(inputs), _RUNS_AT_ONCE)]
     together = partial(_fuse_together, settings=settings, with_forward=with_forward)
@@ -184,7 +208,7 @@ def fuse_batch(
     return [result for batch in done for result in batch]
 
 
-def prepare_run(item: FusionInput) -> Run:
+def prepare_run(item: FusionInput, settings: FusionSettings) -> Run:
     """Return what of one input the smoother uses, with its times aligned."""
     lever_arm_mm = as_float_array("lever_arm_mm", item.lever_arm_mm, (3,))
     if not np.isfinite(lever_arm_mm).all():
@@ -194,17 +218,53 @@ def prepare_run(item: FusionInput) -> Run:
             f"output_t_ns has shape {item.output_t_ns.shape} and type {item.output_t_ns.dtype}; "
             "expected one dimension of int64 ns"
         )
-    alignment = item.alignment or align_times(item.optical, item.imu)
+    if item.camera is None:
+        alignment, motion, is_near = item.alignment or align_times(item.optical, item.imu), None, True
+    else:
+        both = align_both(item.optical, item.imu, item.camera)
+        alignment, motion = both.brick, both.motion
+        is_near = "stamps" not in (both.brick.source, both.camera.source)
     imu = item.imu if alignment.sample_clock is None else alignment.sample_clock.restamp(item.imu)
-    return Run.from_tracks(
-        item.optical, imu, alignment, lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns
+    return _run(item, imu, alignment, motion, lever_arm_mm, settings, is_near=is_near)
+
+
+def _run(
+    item: FusionInput,
+    imu: ImuTrack,
+    alignment: TimeAlignment,
+    motion: CameraMotion | None,
+    lever_arm_mm: FloatArray,
+    settings: FusionSettings,
+    *,
+    is_near: bool,
+) -> Run:
+    camera = motion and settle_delay(
+        item.optical, imu, alignment, motion, lever_arm_mm=lever_arm_mm, settings=settings, is_near=is_near
     )
+    return Run.from_tracks(
+        item.optical, imu, alignment,
+        lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns, camera=camera,
+    )  # fmt: skip
+
+
+def _with_better_clocks(item: FusionInput, s: Smoothed, settings: FusionSettings) -> Run:
+    """Return the run of a moving camera anew: its poses in still axes are only as good as the clocks."""
+    x = s.estimate.state.x[0, s.b]
+    alignment = replace(s.run.alignment, offset_ns=float(x[TAU] * 1e9), skew=float(x[SKEW]))
+    return _run(item, s.run.imu, alignment, s.run.camera, s.run.lever_arm_m * 1e3, settings, is_near=True)
 
 
 def _fuse_together(
     inputs: Sequence[FusionInput], settings: FusionSettings, with_forward: bool
 ) -> list[FusionResult]:
-    smoothed = smooth_poses([prepare_run(item) for item in inputs], settings)
+    runs = [prepare_run(item, settings) for item in inputs]
+    smoothed = smooth_poses(runs, settings)
+    if any(run.camera is not None for run in runs):
+        runs = [
+            s.run if s.run.camera is None else _with_better_clocks(item, s, settings)
+            for item, s in zip(inputs, smoothed, strict=True)
+        ]
+        smoothed = smooth_poses(runs, settings)
     return [
         fused_result(item, s, settings, with_forward=with_forward)
         for item, s in zip(inputs, smoothed, strict=True)

@@ -58,14 +58,16 @@ def sample_motion(
     t = np.clip(t, nodes.t_s[0], nodes.t_s[-1])
     k = np.clip(np.searchsorted(nodes.t_s, t, side="right") - 1, 0, n - 2)
     x, R = estimate.state.x[k, b], estimate.state.R[k, b]
+    lag_s = float(x0[LAG])
     dt = t - nodes.t_s[k]
     part = run.signal.increments(
-        nodes.t_s[k], t, gyro_bias_radps=x[:, BG], acc_bias_mps2=x[:, BA], acc_lag_s=float(x0[LAG])
+        nodes.t_s[k], t, gyro_bias_radps=x[:, BG], acc_bias_mps2=x[:, BA], acc_lag_s=lag_s
     )
     h = dt[:, None]
     R_t = R @ part.R
-    v = x[:, VEL] + h * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dv_mps)
-    p = x[:, POS] + h * x[:, VEL] + 0.5 * h**2 * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dp_m)
+    part_v, part_p = _camera_part(run, nodes.t_s[k], t, lag_s)
+    v = x[:, VEL] + h * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dv_mps) + part_v
+    p = x[:, POS] + h * x[:, VEL] + 0.5 * h**2 * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dp_m) + part_p
     cov = estimate.covariance[k, b]
     if is_smoothed:
         span = nodes.t_s[k + 1] - nodes.t_s[k]
@@ -74,14 +76,23 @@ def sample_motion(
             nodes.t_s[k + 1],
             gyro_bias_radps=x[:, BG],
             acc_bias_mps2=x[:, BA],
-            acc_lag_s=float(x0[LAG]),
+            acc_lag_s=lag_s,
         )
         s, a = span[:, None], (dt / span)[:, None]
         after_x, after_R = estimate.state.x[k + 1, b], estimate.state.R[k + 1, b]
         miss_turn = rvec_from_matrix(np.swapaxes(R @ whole.R, 1, 2) @ after_R)
-        miss_v = after_x[:, VEL] - (x[:, VEL] + s * x[:, GRAV] + np.einsum("nij,nj->ni", R, whole.dv_mps))
+        whole_v, whole_p = _camera_part(run, nodes.t_s[k], nodes.t_s[k + 1], lag_s)
+        miss_v = (
+            after_x[:, VEL]
+            - (x[:, VEL] + s * x[:, GRAV] + np.einsum("nij,nj->ni", R, whole.dv_mps))
+            - whole_v
+        )
         miss_p = after_x[:, POS] - (
-            x[:, POS] + s * x[:, VEL] + 0.5 * s**2 * x[:, GRAV] + np.einsum("nij,nj->ni", R, whole.dp_m)
+            x[:, POS]
+            + s * x[:, VEL]
+            + 0.5 * s**2 * x[:, GRAV]
+            + np.einsum("nij,nj->ni", R, whole.dp_m)
+            + whole_p
         )
         R_t = R_t @ matrix_from_rvec(a * miss_turn)
         p = p + (3 * a**2 - 2 * a**3) * miss_p + s * (a**3 - a**2) * miss_v
@@ -111,7 +122,7 @@ def sample_motion(
     R_out, omega = R_out.copy(), omega.copy()
     for values in (R_out, t_mm, omega, v_mmps, P):
         values[lost] = np.nan
-    return FusedTrack(
+    track = FusedTrack(
         t_ns=output_t_ns,
         R_camera_brick=R_out,
         t_camera_brick_mm=t_mm,
@@ -120,6 +131,17 @@ def sample_motion(
         covariance=P,
         flags=flags,
     )
+    return track if run.camera is None else run.camera.to_camera(track, t)
+
+
+def _camera_part(
+    run: Run, start_s: FloatArray, end_s: FloatArray, lag_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return what a moving camera adds to velocity and displacement between instants, shape (n, 3) each."""
+    if run.camera is None:
+        return np.zeros((len(start_s), 3)), np.zeros((len(start_s), 3))
+    felt = run.camera.increments(start_s, end_s, acc_lag_s=lag_s)
+    return felt[:, 0], felt[:, 1]
 
 
 def common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> FloatArray:

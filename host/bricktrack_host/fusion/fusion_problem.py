@@ -1,12 +1,13 @@
 """From tracks to the smoother's problem: nodes in time, noise of each step, start values and their sd."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.moving_camera import CameraMotion, imu_seconds, still_track
 from bricktrack_host.fusion.smoother import (
     ATT,
     BA,
@@ -57,6 +58,9 @@ class Run:
         Frames with a pose, camera time.
     frame : ndarray of int64, shape (n,)
         Their index in the optical track.
+    camera : CameraMotion or None
+        Where the camera moves: poses are then in still axes about its IMU, and gravity is its accelerometer's
+        bias.
     """
 
     imu: ImuTrack
@@ -70,6 +74,7 @@ class Run:
     cov_seen: FloatArray
     t_mid_s: float
     span_cam_s: tuple[float, float]
+    camera: CameraMotion | None = None
 
     @classmethod
     def from_tracks(
@@ -80,9 +85,12 @@ class Run:
         *,
         lever_arm_mm: FloatArray,
         output_t_ns: IntArray,
+        camera: CameraMotion | None = None,
     ) -> "Run":
         """Return what of a run is used: frames with a pose, and the time to be covered."""
         signal = ImuSignal.from_track(imu, gyro_filter_s=alignment.gyro_filter_s)
+        if camera is not None:
+            optical = still_track(optical, camera, imu_seconds(alignment, optical.t_ns, signal.epoch_ns))
         seen = np.flatnonzero(has_pose(optical))
         t_cam_s = seconds_since(optical.t_ns[seen], signal.epoch_ns)
         cov = optical.covariance[seen].copy()
@@ -110,6 +118,7 @@ class Run:
             cov_seen=cov,
             t_mid_s=(alignment.t_mid_ns - signal.epoch_ns) * 1e-9,
             span_cam_s=span,
+            camera=camera,
         )
 
     def with_acc_loss(self, loss_s2: float) -> "Run":
@@ -119,7 +128,8 @@ class Run:
             gyro_filter_s=self.alignment.gyro_filter_s,
             acc_filter_s=float(np.sqrt(max(loss_s2, 0.0))),
         )
-        return replace(self, signal=signal)
+        camera = None if self.camera is None else self.camera.with_acc_loss(loss_s2)
+        return replace(self, signal=signal, camera=camera)
 
     def imu_time_s(self, t_cam_s: FloatArray, lin: Linearisation) -> FloatArray:
         """Return IMU time of camera time at the linearisation point."""
@@ -150,6 +160,7 @@ def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
     down = -np.median(force, axis=0)
     norm = float(np.linalg.norm(down))
     down = down / norm if norm > 0 else np.array([0.0, 1.0, 0.0])
+    gravity = down * settings.gravity_mps2 if run.camera is None else np.zeros(3)
     return Linearisation(
         tau_s=tau,
         skew=a.skew,
@@ -160,7 +171,7 @@ def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
         R_first=run.R_seen[0],
         v_first_mps=np.zeros(3),
         p_first_m=run.p_seen_m[0] + run.R_seen[0] @ run.lever_arm_m,
-        gravity_mps2=down * settings.gravity_mps2,
+        gravity_mps2=gravity,
     )
 
 
@@ -199,6 +210,10 @@ class NoiseParts:
     acc_fixed: FloatArray
     acc_rough: FloatArray
     acc_systematic: FloatArray
+
+    def __add__(self, other: "NoiseParts") -> "NoiseParts":
+        """Return the densities of two sensors together."""
+        return NoiseParts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     def gyro(self, level: "NoiseLevel") -> FloatArray:
         """Return the whole density for one level."""
@@ -262,6 +277,14 @@ def noise_parts(
     )
 
 
+def camera_noise(
+    camera: CameraMotion, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
+) -> NoiseParts:
+    """Return the noise that the camera's own sensor adds over the steps between instants of IMU time."""
+    own = replace(lin, bg_radps=camera.bias_radps, lag_s=camera.acc_lag_s(lin.lag_s))
+    return noise_parts(camera.signal, camera.own_s(t_s), own, settings)
+
+
 def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> FloatArray:
     """Return the covariance of the start values, shape (22, 22): wide where the first frames will tell."""
     s, a = settings, run.alignment
@@ -274,6 +297,9 @@ def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> 
     else:
         sd[TAU], sd[SKEW] = a.offset_sd_ns * 1e-9, a.skew_sd
     sd[LAG], sd[LOSS] = s.acc_lag_sd_ns * 1e-9, s.acc_loss_sd_s2
+    if run.camera is not None:
+        sd[GRAV] = s.acc_bias_sd_mps2
+        return np.diag(sd**2)
     P = np.diag(sd**2)
     along = lin.gravity_mps2 / np.linalg.norm(lin.gravity_mps2)
     P[GRAV, GRAV] += (s.gravity_sd_mps2**2 - sd[GRAV.start] ** 2) * np.outer(along, along)
@@ -317,11 +343,13 @@ def build_problem(
         dp_m=zeros3.copy(),
         f_rate_mps3=zeros3.copy(),
         f_curve_mps4=zeros3.copy(),
+        known=np.zeros((*steps, 4, 3)),
         gyro_var=np.zeros(steps),
         acc_var=np.zeros(steps),
         gyro_bias_walk=np.full(steps, settings.gyro_bias_walk_radps**2),
         acc_bias_walk=np.full(steps, settings.acc_bias_walk_mps2**2),
         omega_radps=np.zeros((n_nodes, n_runs, 3)),
+        camera_omega_radps=np.zeros((n_nodes, n_runs, 3)),
         has_frame=np.zeros((n_nodes, n_runs), dtype=np.bool_),
         R_seen=np.broadcast_to(eye, (n_nodes, n_runs, 3, 3)).copy(),
         p_seen_m=np.zeros((n_nodes, n_runs, 3)),
@@ -351,6 +379,11 @@ def build_problem(
         pr.dv_mps[:k, b], pr.dp_m[:k, b] = step.dv_mps, step.dp_m
         pr.f_rate_mps3[:k, b], pr.f_curve_mps4[:k, b] = step.f_rate_mps3, step.f_curve_mps4
         parts.append(noise_parts(run.signal, node.t_s, lin, settings))
+        if run.camera is not None:
+            start_s, end_s = node.t_s[:-1], node.t_s[1:]
+            pr.known[:k, b] = run.camera.increments(start_s, end_s, acc_lag_s=lin.lag_s)
+            parts[b] = parts[b] + camera_noise(run.camera, node.t_s, lin, settings)
+            pr.camera_omega_radps[: k + 1, b] = run.camera.still_omega_radps(node.t_s)
         pr.gyro_var[:k, b], pr.acc_var[:k, b] = parts[b].gyro(levels[b][0]), parts[b].acc(levels[b][1])
         pr.omega_radps[: k + 1, b] = run.signal.gyro_at(node.t_s)
         at = node.node_of_frame

@@ -86,7 +86,7 @@ def smooth_poses(runs: list[Run], settings: FusionSettings) -> list[Smoothed]:
         good = far < settings.gate_chi2
         used[b] = good if good.mean() > 0.5 else used[b]  # else it is not the frames that are wrong
     # Relinearised once, with what the first pass found of clocks, noise and outliers.
-    lins = [relinearised(first.estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
+    lins = [relinearised(runs[b], first.estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
     runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(first.runs, lins, strict=True)]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
     for is_last in (False, True):
@@ -134,10 +134,14 @@ def _attitude_at_first_node(run: Run, nodes: Nodes, lin: Linearisation) -> tuple
     return nearest_rotation(first[best]), agrees
 
 
-def relinearised(estimate: Estimate, b: int, n_nodes: int, settings: FusionSettings) -> Linearisation:
+def relinearised(
+    run: Run, estimate: Estimate, b: int, n_nodes: int, settings: FusionSettings
+) -> Linearisation:
     """Return the linearisation at the first pass's result for run b."""
     x = estimate.state.x[:n_nodes, b]
     gravity = x[0, GRAV]
+    if run.camera is None:
+        gravity = gravity * settings.gravity_mps2 / np.linalg.norm(gravity)
     return Linearisation(
         tau_s=float(x[0, TAU]),
         skew=float(x[0, SKEW]),
@@ -148,5 +152,5 @@ def relinearised(estimate: Estimate, b: int, n_nodes: int, settings: FusionSetti
         R_first=nearest_rotation(estimate.state.R[0, b]),
         v_first_mps=x[0, VEL],
         p_first_m=x[0, POS],
-        gravity_mps2=gravity * settings.gravity_mps2 / np.linalg.norm(gravity),
+        gravity_mps2=gravity,
     )

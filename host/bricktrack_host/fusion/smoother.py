@@ -31,11 +31,15 @@ class Problem:
     R_step, R_half : ndarray, shape (K - 1, B, 3, 3)
     dv_mps, dp_m, f_rate_mps3, f_curve_mps4 : ndarray, shape (K - 1, B, 3)
         Increments at the linearisation point of biases, lag and loss, see `imu_signal.Increments`.
+    known : ndarray, shape (K - 1, B, 4, 3)
+        What a moving camera adds, in still axes, see `moving_camera.CameraMotion.increments`; else zero.
     gyro_var, acc_var : ndarray, shape (K - 1, B), rad^2/s and m^2/s^3
         Spectral densities of the inertial noise.
     gyro_bias_walk, acc_bias_walk : ndarray, shape (K - 1, B), rad^2/s^3 and m^2/s^5
     omega_radps : ndarray, shape (K, B, 3)
         Measured angular rate at the nodes.
+    camera_omega_radps : ndarray, shape (K, B, 3)
+        Angular rate of a moving camera in still axes; else zero.
     has_frame : ndarray of bool, shape (K, B)
     R_seen, p_seen_m, cov_seen : ndarray, shape (K, B, 3, 3), (K, B, 3), (K, B, 6, 6)
         Optical poses of the brick's origin; covariance of [dtheta rad, dt m].
@@ -58,11 +62,13 @@ class Problem:
     dp_m: FloatArray
     f_rate_mps3: FloatArray
     f_curve_mps4: FloatArray
+    known: FloatArray
     gyro_var: FloatArray
     acc_var: FloatArray
     gyro_bias_walk: FloatArray
     acc_bias_walk: FloatArray
     omega_radps: FloatArray
+    camera_omega_radps: FloatArray
     has_frame: BoolArray
     R_seen: FloatArray
     p_seen_m: FloatArray
@@ -122,6 +128,8 @@ def observe(
     lever_arm_m: FloatArray,
     since_mid_s: FloatArray,
     dt_s: FloatArray,
+    *,
+    camera_omega_radps: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what a frame shows: attitude and origin of the brick, and the Jacobian of their errors.
 
@@ -131,24 +139,31 @@ def observe(
         At the node; the frame lies ``dt_s`` later by the present estimate of offset and skew.
     omega_radps : ndarray, shape (..., 3)
         Angular rate less bias.
+    camera_omega_radps : ndarray, shape (..., 3), optional
+        Of a camera that moves, in still axes: what it sees moves by the difference.
 
     Returns
     -------
     R, p_m, H : ndarray, shape (..., 3, 3), (..., 3), (..., 6, 22)
     """
     arm = _matvec(state.R, np.broadcast_to(lever_arm_m, omega_radps.shape))
+    p_m = state.x[..., POS] - arm
+    turn = omega_radps
     v_origin = state.x[..., VEL] - _matvec(state.R, np.cross(omega_radps, lever_arm_m))
+    if camera_omega_radps is not None:
+        turn = turn - _matvec(np.swapaxes(state.R, -1, -2), camera_omega_radps)
+        v_origin = v_origin - np.cross(camera_omega_radps, p_m)
     H = np.zeros((*omega_radps.shape[:-1], 6, N_STATES))
     eye = np.eye(3)
     H[..., :3, ATT] = eye
-    H[..., :3, TAU] = omega_radps
-    H[..., :3, SKEW] = omega_radps * since_mid_s[..., None]
+    H[..., :3, TAU] = turn
+    H[..., :3, SKEW] = turn * since_mid_s[..., None]
     H[..., 3:, ATT] = state.R @ skew(np.broadcast_to(lever_arm_m, omega_radps.shape))
     H[..., 3:, POS] = eye
     H[..., 3:, TAU] = v_origin
     H[..., 3:, SKEW] = v_origin * since_mid_s[..., None]
-    R = state.R @ matrix_from_rvec(omega_radps * dt_s[..., None])
-    return R, np.asarray(state.x[..., POS] - arm + v_origin * dt_s[..., None]), H
+    R = state.R @ matrix_from_rvec(turn * dt_s[..., None])
+    return R, np.asarray(p_m + v_origin * dt_s[..., None]), H
 
 
 def residuals(problem: Problem, state: State, at: IntArray, b: int) -> tuple[FloatArray, FloatArray]:
@@ -157,7 +172,8 @@ def residuals(problem: Problem, state: State, at: IntArray, b: int) -> tuple[Flo
     since_mid = problem.since_mid_s[at, b]
     dt = (x[:, TAU] - problem.tau_lin[b]) + since_mid * (x[:, SKEW] - problem.skew_lin[b])
     omega = problem.omega_radps[at, b] - x[:, BG]
-    R, p, H = observe(State(R_at, x), omega, problem.lever_arm_m[b], since_mid, dt)
+    camera = problem.camera_omega_radps[at, b]
+    R, p, H = observe(State(R_at, x), omega, problem.lever_arm_m[b], since_mid, dt, camera_omega_radps=camera)
     turn = rvec_from_matrix(np.swapaxes(R, -1, -2) @ problem.R_seen[at, b])
     return np.concatenate([turn, problem.p_seen_m[at, b] - p], axis=-1), H
 
@@ -238,7 +254,18 @@ class Filter:
         pr = self._problem
         for b in range(len(self.log_likelihood)):
             backward_pass(
-                b, pr.dt_s, pr.R_step, self._effect, self.R, self.x, self.P, *self._predicted, R, x, P
+                b,
+                pr.dt_s,
+                pr.R_step,
+                self._effect,
+                pr.known,
+                self.R,
+                self.x,
+                self.P,
+                *self._predicted,
+                R,
+                x,
+                P,
             )
         return Estimate(State(R, x), P, self.nis)
 
@@ -299,9 +326,9 @@ def _forward(
     pr = problem
     x = pr.start.x[b].copy()
     log_likelihood = forward_pass(
-        b, pr.dt_s, pr.R_step, pr.dv_mps, pr.dp_m, effect,
+        b, pr.dt_s, pr.R_step, pr.dv_mps, pr.dp_m, effect, pr.known,
         np.ascontiguousarray(gyro_var), np.ascontiguousarray(acc_var),
-        pr.gyro_bias_walk, pr.acc_bias_walk, pr.omega_radps,
+        pr.gyro_bias_walk, pr.acc_bias_walk, pr.omega_radps, pr.camera_omega_radps,
         pr.has_frame, pr.R_seen, pr.p_seen_m, pr.cov_seen, pr.since_mid_s,
         pr.lever_arm_m[b], pr.bg_lin[b], np.append(pr.ba_lin[b], [pr.lag_lin[b], pr.loss_lin[b]]),
         pr.tau_lin[b], pr.skew_lin[b],

@@ -142,7 +142,7 @@ def _orthonormal(R: Any) -> None:
 
 
 @compiled
-def _transition(R: Any, dt: float, R_step: Any, effect: Any, F: Any) -> None:
+def _transition(R: Any, dt: float, R_step: Any, effect: Any, known: Any, F: Any) -> None:
     """Write the moving rows of the transition, shape (9, 22), for a state with attitude R."""
     F[:] = 0.0
     for i in range(3):
@@ -158,6 +158,9 @@ def _transition(R: Any, dt: float, R_step: Any, effect: Any, F: Any) -> None:
             at = j if j < 3 else (9 + j if j < 6 else 14 + j)
             F[6 + i, at] = R[i, 0] * effect[0, j] + R[i, 1] * effect[1, j] + R[i, 2] * effect[2, j]
             F[3 + i, at] = R[i, 0] * effect[3, j] + R[i, 1] * effect[4, j] + R[i, 2] * effect[5, j]
+        for j in range(2):
+            F[6 + i, 20 + j] += known[2 + j, i] * dt
+            F[3 + i, 20 + j] += 0.5 * known[2 + j, i] * dt * dt
 
 
 @compiled
@@ -198,12 +201,14 @@ def _propagate(F: Any, P: Any, FP: Any, dt: float, gyro: float, acc: float, bg: 
 
 
 @compiled
-def _move(R: Any, x: Any, dt: float, R_step: Any, dv: Any, dp: Any, F: Any, off: Any, bg_lin: Any) -> None:
+def _move(
+    R: Any, x: Any, dt: float, R_step: Any, dv: Any, dp: Any, known: Any, F: Any, off: Any, bg_lin: Any
+) -> None:
     """Carry the state over one step; ``off`` is how far biases, lag and loss are from their linearisation."""
     turn = np.empty(3)
     for i in range(3):
-        step_v = R[i, 0] * dv[0] + R[i, 1] * dv[1] + R[i, 2] * dv[2]
-        step_p = R[i, 0] * dp[0] + R[i, 1] * dp[1] + R[i, 2] * dp[2]
+        step_v = known[0, i] + R[i, 0] * dv[0] + R[i, 1] * dv[1] + R[i, 2] * dv[2]
+        step_p = known[1, i] + R[i, 0] * dp[0] + R[i, 1] * dp[1] + R[i, 2] * dp[2]
         for j in range(5):
             at = 12 + j if j < 3 else 17 + j
             step_v += F[6 + i, at] * off[j]
@@ -303,26 +308,44 @@ def _correct(H: Any, C: Any, y: Any, n: int, chi2_95: float, R: Any, x: Any, P: 
 
 @compiled
 def _observe_pose(
-    R: Any, x: Any, w: Any, arm: Any, since: float, dt: float, R_seen: Any, p_seen: Any, H: Any, y: Any
+    R: Any,
+    x: Any,
+    w: Any,
+    camera: Any,
+    arm: Any,
+    since: float,
+    dt: float,
+    R_seen: Any,
+    p_seen: Any,
+    H: Any,
+    y: Any,
 ) -> None:
-    """Write residual and Jacobian of a pose seen ``dt`` after the state by the present offset and skew."""
+    """Write residual and Jacobian of a pose seen ``dt`` after the state by the present offset and skew.
+
+    ``camera`` is the camera's angular rate in still axes: what it sees moves by the difference.
+    """
     c = np.empty(3)  # velocity of the origin less that of the IMU, body axes
     c[0] = -(w[1] * arm[2] - w[2] * arm[1])
     c[1] = -(w[2] * arm[0] - w[0] * arm[2])
     c[2] = -(w[0] * arm[1] - w[1] * arm[0])
     H[:] = 0.0
+    turn = np.empty(3)
+    for i in range(3):
+        turn[i] = w[i] - (R[0, i] * camera[0] + R[1, i] * camera[1] + R[2, i] * camera[2])
     for i in range(3):
         H[i, i] = 1.0
-        H[i, 18], H[i, 19] = w[i], w[i] * since
+        H[i, 18], H[i, 19] = turn[i], turn[i] * since
         H[3 + i, 0] = R[i, 1] * arm[2] - R[i, 2] * arm[1]
         H[3 + i, 1] = R[i, 2] * arm[0] - R[i, 0] * arm[2]
         H[3 + i, 2] = R[i, 0] * arm[1] - R[i, 1] * arm[0]
         H[3 + i, 3 + i] = 1.0
         v = x[6 + i] + R[i, 0] * c[0] + R[i, 1] * c[1] + R[i, 2] * c[2]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        v -= camera[j] * p_seen[k] - camera[k] * p_seen[j]
         H[3 + i, 18], H[3 + i, 19] = v, v * since
         y[3 + i] = p_seen[i] - (x[3 + i] - R[i, 0] * arm[0] - R[i, 1] * arm[1] - R[i, 2] * arm[2] + v * dt)
     ahead = R.copy()
-    _turn_by(ahead, w * dt)
+    _turn_by(ahead, turn * dt)
     _rotation_vector(ahead, R_seen, y[:3])
 
 
@@ -437,11 +460,13 @@ def forward_pass(
     dv: Any,
     dp: Any,
     effect: Any,
+    known: Any,
     gyro_var: Any,
     acc_var: Any,
     gyro_walk: Any,
     acc_walk: Any,
     omega: Any,
+    camera_omega: Any,
     has_frame: Any,
     R_seen: Any,
     p_seen: Any,
@@ -483,11 +508,11 @@ def forward_pass(
             j = k - 1
             h = dt[j, b]
             if h > 0.0:
-                _transition(R, h, R_step[j, b], effect[j, b], F)
+                _transition(R, h, R_step[j, b], effect[j, b], known[j, b], F)
                 for i in range(3):
                     off[i] = x[12 + i] - off_lin[i]
                 off[3], off[4] = x[20] - off_lin[3], x[21] - off_lin[4]
-                _move(R, x, h, R_step[j, b], dv[j, b], dp[j, b], F, off, bg_lin)
+                _move(R, x, h, R_step[j, b], dv[j, b], dp[j, b], known[j, b], F, off, bg_lin)
                 _propagate(F, P, FP, h, gyro_var[j], acc_var[j], gyro_walk[j, b], acc_walk[j, b])
         if keep:
             R_pred[k, b] = R
@@ -498,7 +523,7 @@ def forward_pass(
             ahead = (x[18] - tau_lin) + since * (x[19] - skew_lin)
             for i in range(3):
                 w[i] = omega[k, b, i] - x[9 + i]
-            _observe_pose(R, x, w, arm, since, ahead, R_seen[k, b], p_seen[k, b], H, y)
+            _observe_pose(R, x, w, camera_omega[k, b], arm, since, ahead, R_seen[k, b], p_seen[k, b], H, y)
             far, log_det, enlarged = _correct(H, cov_seen[k, b], y, 6, CHI2_6_95, R, x, P)
             nis[k, b], inflation[k, b] = far, enlarged
             log_likelihood -= 0.5 * (log_det + min(far, _NIS_CAP))
@@ -522,6 +547,7 @@ def backward_pass(
     dt: Any,
     R_step: Any,
     effect: Any,
+    known: Any,
     R_kept: Any,
     x_kept: Any,
     P_kept: Any,
@@ -550,7 +576,7 @@ def backward_pass(
             P_out[k, b] = P_out[k + 1, b]
             continue
         P = P_kept[k, b]
-        _transition(R_kept[k, b], dt[k, b], R_step[k, b], effect[k, b], F)
+        _transition(R_kept[k, b], dt[k, b], R_step[k, b], effect[k, b], known[k, b], F)
         _times(F, P, B)
         for i in range(M, N):
             B[i] = P[i]

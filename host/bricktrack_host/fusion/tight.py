@@ -122,7 +122,7 @@ def fuse_tight(
     """
     settings = settings or FusionSettings()
     item = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment)
-    first = smooth_poses([prepare_run(item)], settings)[0]
+    first = smooth_poses([prepare_run(item, settings)], settings)[0]
     pose_level = fused_result(item, first, settings)
     leds = SeenLeds.of(observations, ray_model)
     leds, smoothed, chi2, use, scale = _smooth_leds(leds, first, ray_model, brick_model, settings)
@@ -174,7 +174,7 @@ def _smooth_leds(
         leds, use = leds.take(placed), use[placed]
         pictured = picture(leds, R[placed], t_mm[placed], ray_model, brick_model)
         use = use & pictured.is_facing
-        lin = relinearised(now.estimate, now.b, len(now.nodes.t_s), settings)
+        lin = relinearised(now.run, now.estimate, now.b, len(now.nodes.t_s), settings)
         run = _without_frames(first.run.with_acc_loss(lin.loss_s2))
         nodes = Nodes(place_nodes(first.run, lin).t_s, np.zeros(0, dtype=np.int64))
         problem, _ = build_problem(

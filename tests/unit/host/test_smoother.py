@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.smoother import (
@@ -46,11 +47,13 @@ def turning_problem(seed=3):
         dp_m=(half @ force[..., None])[..., 0] * DT**2 / 2,
         f_rate_mps3=rng.normal(0, 100, (*steps, 3)),
         f_curve_mps4=rng.normal(0, 1e4, (*steps, 3)),
+        known=rng.normal(0, 1, (*steps, 4, 3)) * np.array([0.05, 3e-4, 100, 1e4])[:, None],
         gyro_var=np.zeros(steps),
         acc_var=np.zeros(steps),
         gyro_bias_walk=np.zeros(steps),
         acc_bias_walk=np.zeros(steps),
         omega_radps=omega,
+        camera_omega_radps=np.zeros((N_NODES, 1, 3)),
         has_frame=np.zeros((N_NODES, 1), dtype=bool),
         R_seen=np.broadcast_to(np.eye(3), (N_NODES, 1, 3, 3)).copy(),
         p_seen_m=np.zeros((N_NODES, 1, 3)),
@@ -103,7 +106,8 @@ def test_covariance_is_carried_by_the_true_derivative_of_the_motion():
         assert np.allclose(P, np.outer(column, column) * size[i] ** 2, rtol=0.02, atol=2e-4 * P.max()), i
 
 
-def test_observation_jacobian_is_the_derivative():
+@pytest.mark.parametrize("camera", [None, np.array([0.4, -0.2, 0.7])])
+def test_observation_jacobian_is_the_derivative(camera):
     rng = np.random.default_rng(4)
     x = np.zeros(N_STATES)
     x[POS], x[VEL] = rng.normal(0, 0.1, 3), rng.normal(0, 0.3, 3)
@@ -112,7 +116,7 @@ def test_observation_jacobian_is_the_derivative():
 
     def seen(d):
         dt = np.array(d[TAU] + since * d[SKEW])
-        return observe(moved(state, d), omega, ARM, since, dt)
+        return observe(moved(state, d), omega, ARM, since, dt, camera_omega_radps=camera)
 
     R, p, H = seen(np.zeros(N_STATES))
     assert np.allclose(p, x[POS] - state.R @ ARM)
@@ -155,6 +159,7 @@ def straight_problem(seed):
         dp_m=force * DT**2 / 2,
         f_rate_mps3=np.zeros((*steps, 3)),
         f_curve_mps4=np.zeros((*steps, 3)),
+        known=np.zeros((*steps, 4, 3)),
         acc_var=acc_var,
         acc_bias_walk=np.full(steps, 1e-3),
         omega_radps=np.zeros((N_NODES, 1, 3)),

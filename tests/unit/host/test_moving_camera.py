@@ -1,0 +1,103 @@
+"""Fusion with a camera that moves, against a simulated relative motion that is the same with it at rest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from brick_shakes import EPOCH_NS, LEVER_ARM_MM
+from scipy.spatial.transform import Rotation
+from two_imus import IMU_TO_CAMERA_MM, simulate_two_imus
+
+from bricktrack_common.errors import ConfigError
+from bricktrack_host.fusion.estimate import fuse
+from bricktrack_host.fusion.moving_camera import CameraImu, mean_rate
+
+DROPOUTS = ((2.0, 2.4), (3.6, 3.9))
+
+
+def outputs(run):
+    return np.arange(run.shake.optical.t_ns[3], run.shake.optical.t_ns[-3], 5_000_000)
+
+
+def fuse_moving(run, *, kind="imu", camera=None):
+    return fuse(
+        run.shake.optical,
+        run.brick,
+        lever_arm_mm=LEVER_ARM_MM,
+        output_t_ns=outputs(run),
+        camera=kind,
+        camera_imu=CameraImu(camera or run.camera, IMU_TO_CAMERA_MM, kind),
+    )
+
+
+def squared_mm(run, result):
+    _, t_mm = run.shake.truth(result.track.t_ns)
+    return ((result.track.t_camera_brick_mm - t_mm) ** 2).sum(axis=1)
+
+
+def rms(squares):
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def test_a_shaken_and_rocked_camera_costs_less_than_five_percent():
+    rest, shaken = [], []
+    for seed in (1, 3):
+        for squares, acc_g, rocking_deg in ((rest, 0.0, 0.0), (shaken, 0.3, 0.5)):
+            run = simulate_two_imus(
+                seed, acc_g=acc_g, rocking_deg=rocking_deg, duration_s=5.0, dropouts=DROPOUTS
+            )
+            squares.append(squared_mm(run, fuse_moving(run)))
+    assert rms(shaken) < 1.05 * rms(rest)
+    assert rms(rest) < 0.1
+
+
+def test_twist_clocks_and_covariance_are_those_of_the_relative_motion():
+    run = simulate_two_imus(2, rocking_deg=1.0, duration_s=5.0, dropouts=DROPOUTS)
+    result = fuse_moving(run)
+    track, shake = result.track, run.shake
+    R, t_mm = shake.truth(track.t_ns)
+    turn = Rotation.from_matrix(np.swapaxes(track.R_camera_brick, 1, 2) @ R).as_rotvec()
+    e = np.concatenate([turn, t_mm - track.t_camera_brick_mm], axis=1)
+    chi2 = (e * np.linalg.solve(track.covariance, e[..., None])[..., 0]).sum(axis=1)
+    assert (chi2 < 12.59).mean() > 0.93  # 95 % of chi-square with 6 degrees of freedom lie below
+    i = np.round((track.t_ns - EPOCH_NS) * 1e-9 * 4000).astype(int) - round(shake.t_s[0] * 4000)
+    # The camera's own angular rate is some 0.6 rad/s and moves the brick in its view by some 80 mm/s.
+    assert np.sqrt(((track.omega_brick_radps - shake.omega_radps[i]) ** 2).sum(axis=1).mean()) < 0.02
+    assert np.sqrt(((track.v_camera_mmps - shake.v_mmps[i]) ** 2).sum(axis=1).mean()) < 3.0
+    assert result.offset_ns * 1e-6 == pytest.approx(4.0, abs=0.15)
+    assert result.acc_lag_ns * 1e-6 == pytest.approx(-3.4, abs=0.2)
+
+
+def test_a_tables_accelerometers_serve_where_it_only_shifts():
+    rest = simulate_two_imus(4, acc_g=0.0, rocking_deg=0.0, duration_s=5.0, dropouts=DROPOUTS)
+    run = simulate_two_imus(
+        4, rocking_deg=0.0, duration_s=5.0, dropouts=DROPOUTS, acc_lag_s=0.0, camera_offset_s=0.0
+    )
+    table = replace(run.camera, gyro_radps=np.zeros_like(run.camera.gyro_radps))
+    result = fuse_moving(run, kind="table", camera=table)
+    assert rms([squared_mm(run, result)]) < 1.1 * rms([squared_mm(rest, fuse_moving(rest))])
+
+
+def test_without_the_cameras_sensor_the_same_run_would_be_wrong_and_is_refused():
+    run = simulate_two_imus(1, rocking_deg=0.0, duration_s=5.0, dropouts=DROPOUTS)
+    arguments = {"lever_arm_mm": LEVER_ARM_MM, "output_t_ns": outputs(run)}
+    with pytest.raises(ConfigError, match="not observable"):
+        fuse(run.shake.optical, run.brick, camera="imu", **arguments)
+    as_static = fuse(run.shake.optical, run.brick, **arguments)
+    assert rms([squared_mm(run, as_static)]) > 3 * rms([squared_mm(run, fuse_moving(run))])
+
+
+def test_contradicting_configurations_are_refused():
+    run = simulate_two_imus(1, duration_s=3.0)
+    arguments = {"lever_arm_mm": LEVER_ARM_MM, "output_t_ns": outputs(run)}
+    sensor = CameraImu(run.camera, IMU_TO_CAMERA_MM)
+    with pytest.raises(ConfigError, match="'table'"):
+        fuse(run.shake.optical, run.brick, camera="table", camera_imu=sensor, **arguments)
+    with pytest.raises(ConfigError, match="'static', 'imu' or 'table'"):
+        fuse(run.shake.optical, run.brick, camera="flying", camera_imu=sensor, **arguments)
+
+
+def test_a_bias_is_the_mean_rate_of_a_body_that_ends_as_it_began():
+    run = simulate_two_imus(1, rocking_deg=1.0, duration_s=4.0)
+    rest = simulate_two_imus(1, acc_g=0.0, rocking_deg=0.0, duration_s=4.0)
+    assert np.allclose(mean_rate(run.camera), mean_rate(rest.camera), atol=1.5e-3)
