@@ -114,7 +114,7 @@ def pixel_shape(model: CentralRays | TwoPlaneIrt) -> PixelShape:
     start = np.array([0, 0, 0, 0, 0, 1, 0, 0, 0, *(xy.mean(axis=0) / size_mm)])
     found = least_squares(left, start, method="lm")
     return PixelShape(
-        stretch=float(2 * found.x[6]),
+        stretch=float((1 + found.x[6]) / (1 - found.x[6]) - 1),
         shear_rad=float(-2 * found.x[7]),
         doubt=3 * float(np.sqrt(2 * np.mean(found.fun**2))),
     )

@@ -218,7 +218,9 @@ class _Fitter:
         """Iterate parameters, noise and variances until the dots stand still."""
         for step in range(MAX_STEPS):
             A, y, _ = self.linearised()
-            normal = A.T @ A
+            ends = 2 * np.cumsum(self.data.counts())[:-1]
+            by_plane = [part.T @ part for part in np.split(A, ends)]
+            normal = np.sum(by_plane, axis=0)
             if step == 0:
                 self._check_determined(normal)
             now = np.concatenate([self.theta, self.rig])
@@ -234,7 +236,7 @@ class _Fitter:
                     self._update_variances(values, S)
             self._take(values)
             moved = A @ (values - now)
-            self._update_noise((y - moved).reshape(-1, 2), S, A)
+            self._update_noise((y - moved).reshape(-1, 2), [float(np.sum(S * N)) for N in by_plane])
             if step >= 6 and np.abs(moved).max() < CONVERGED:
                 return
         raise CalibrationError(
@@ -259,15 +261,14 @@ class _Fitter:
             size = float(values[own] @ values[own]) / max(determined, 1e-3)
             self.variance[group] = max(size, (LEAST_HELD * self._unit(group)) ** 2)
 
-    def _update_noise(self, whitened: FloatArray, S: FloatArray, A: FloatArray) -> None:
-        """Find each plane's scatter such that its squares sum to what the fit leaves free."""
-        spent = np.sum((A @ S) * A, axis=1).reshape(-1, 2).sum(axis=1)
+    def _update_noise(self, whitened: FloatArray, spent: list[float]) -> None:
+        """Find each plane's scatter such that its squares sum to what the fit has not spent."""
         L = self.whitening()
         mm = np.linalg.solve(L, whitened[:, :, None])
         px = np.linalg.solve(self.data.mm_per_px, mm)[:, :, 0]
         for k in range(len(self.noise)):
             own = self.data.plane == k
-            freedom = max(2 * np.count_nonzero(own) - float(spent[own].sum()), 1.0)
+            freedom = max(2 * np.count_nonzero(own) - spent[k], 1.0)
             self.noise[k] = _scatter(px[own], self.data.cov_px2[own], freedom)
 
     def _check_determined(self, normal: FloatArray) -> None:

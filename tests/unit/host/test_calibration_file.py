@@ -2,6 +2,7 @@
 
 import json
 from datetime import UTC, datetime
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -21,6 +22,7 @@ from bricktrack_host.calibration.dot_observations import DotObservations
 from bricktrack_host.calibration.ray_calibration import calibrate_rays
 
 PLANES_MM = (101.117, 161.111)
+DATA = Path(__file__).resolve().parents[2] / "data" / "calibrations"
 
 
 def see(z_mm):
@@ -100,6 +102,47 @@ def test_the_model_made_for_the_file_is_the_fitted_one():
     assert "central rays" in made.method
 
 
+@pytest.mark.parametrize(
+    ("kind", "xy_mm", "sd_mm"),
+    [
+        (
+            "central",
+            [[-59.06771583, -30.41138477], [48.14134474, 32.11448124], [-87.95637481, -49.23713795]],
+            [0.00351378, 0.00304257, 0.0118645],
+        ),
+        (
+            "two-plane",
+            [[-59.03181929, -30.38924319], [48.12769656, 32.09680651], [-87.79302623, -49.14012076]],
+            [0.00741151, 0.0059829, 0.03128622],
+        ),
+    ],
+)
+def test_files_of_version_1_are_still_read(kind, xy_mm, sd_mm):
+    """Written, and their points and standard deviations printed, by the code of that time."""
+    calibration = load_calibration(DATA / f"version-1-{kind}.json")
+    assert (calibration.unit, calibration.choice.order) == ("brick-1", 3)
+    assert not calibration.choice.held
+    uv = np.array([[300.0, 200.0], [1500.0, 900.0], [5.0, 5.0]])
+    model = calibration.ray_model
+    np.testing.assert_allclose(model.points_on_plane(uv, 140.0), xy_mm, atol=1e-8)
+    np.testing.assert_allclose(model.point_sd_mm(uv, 140.0), sd_mm, rtol=1e-5)
+
+
+def test_a_damaged_file_of_version_1_is_refused(tmp_path):
+    data = json.loads((DATA / "version-1-central.json").read_text())
+    data["rays"]["covariance_lower"].pop()
+    path = tmp_path / "old.json"
+    path.write_text(json.dumps(data))
+    with pytest.raises(
+        CalibrationError, match=r"old\.json: a covariance of 275 numbers; expected 276 for 23"
+    ):
+        load_calibration(path)
+    data["rays"]["order"] = -1
+    path.write_text(json.dumps(data))
+    with pytest.raises(CalibrationError, match=r"old\.json: rays\.order is -1"):
+        load_calibration(path)
+
+
 def test_the_file_says_what_it_is_in_plain_text(path):
     data = json.loads(path.read_text())
     assert data["format"] == "bricktrack-calibration"
@@ -110,6 +153,8 @@ def test_the_file_says_what_it_is_in_plain_text(path):
     assert [len(i["sha256"]) for i in data["images"]] == [64, 64]
     assert data["choice"]["candidates"][0]["rms_um"] > 0
     assert data["residuals"][0]["mean_um"] < data["residuals"][0]["max_um"]
+    assert data["tolerance"] == {"shift_mm": 0.0, "turn_rad": 0.0, "bend_mm": 0.0}
+    assert len(data["noise"]) == 2
 
 
 def test_a_newer_version_is_refused_by_name(path):
