@@ -7,6 +7,7 @@ saved. What comes when all places are taken is hung up on at once; who is connec
 import itertools
 import logging
 import os
+import resource
 import socket
 import time
 
@@ -15,8 +16,10 @@ from zmq.utils.monitor import parse_monitor_message
 
 logger = logging.getLogger(__name__)
 
-MAX_CONNECTIONS = 128
+MAX_CONNECTIONS = 64
+DESCRIPTORS = 4096
 _TELL_AGAIN_S = 60.0
+_COUNT_AGAIN_S = 1.0
 _MAX_EVENTS_AT_ONCE = 1000
 _EVENTS = (
     zmq.EVENT_ACCEPTED
@@ -32,6 +35,14 @@ _WORDS = {
     "accept": "connections could not be accepted: the process is out of file descriptors",
 }
 _numbers = itertools.count()
+
+
+def raise_descriptor_limit(wanted: int = DESCRIPTORS) -> None:
+    """Let this process open more files, as far as it may: hanging up on a connection takes a moment."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    ceiling = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    if soft != resource.RLIM_INFINITY and soft < ceiling:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (ceiling, hard))
 
 
 class ConnectionGuard:
@@ -50,6 +61,7 @@ class ConnectionGuard:
         self._open: set[int] = set()
         self._counts = dict.fromkeys(_WORDS, 0)
         self._told_s = -_TELL_AGAIN_S
+        self._counted_s = -_COUNT_AGAIN_S
         self.port = 0
         self.n_refused = 0
         address = f"inproc://connections-{next(_numbers)}"
@@ -84,8 +96,7 @@ class ConnectionGuard:
         if event == zmq.EVENT_ACCEPTED:
             self._open.add(value)
             if len(self._open) > self._max:
-                # Should an end have gone unheard, its place would be taken for ever.
-                self._open = {n for n in self._open if self._is_ours(n)}
+                self._forget_ended()
             if len(self._open) > self._max:
                 self._counts["full"] += 1
                 self.n_refused += 1
@@ -96,6 +107,13 @@ class ConnectionGuard:
             self._counts["accept"] += 1
         else:
             self._counts["failed"] += 1
+
+    def _forget_ended(self) -> None:
+        """Free places whose end went unheard; only now and then, because it is slow."""
+        now = time.monotonic()
+        if now - self._counted_s >= _COUNT_AGAIN_S:
+            self._counted_s = now
+            self._open = {n for n in self._open if self._is_ours(n)}
 
     def _hang_up(self, descriptor: int) -> None:
         """End a connection that ZeroMQ owns: it sees an end of file, and closes it.

@@ -10,6 +10,7 @@ from bricktrack_common.discovery import Announcement
 from bricktrack_common.key_files import fingerprint
 from bricktrack_device.advertisement import Advertisement
 from bricktrack_device.config import DeviceConfig
+from bricktrack_device.connection_guard import raise_descriptor_limit
 from bricktrack_device.file_server import FileServer
 from bricktrack_device.health.watch import HealthWatch
 from bricktrack_device.interfaces import Rig
@@ -55,6 +56,7 @@ class Daemon:
         BricktrackError
             If the storage folder cannot be written or the port is taken.
         """
+        raise_descriptor_limit()
         store = RunStore(self._config.storage_folder, self._config.unit.name)
         try:
             store.lock()

@@ -256,6 +256,17 @@ def test_connections_are_bounded_and_those_that_are_there_stay(monkeypatch: pyte
         server.stop()
 
 
+def test_more_descriptors_are_taken_as_far_as_they_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = {"now": (256, 1000)}
+    monkeypatch.setattr(connection_guard.resource, "getrlimit", lambda _: limits["now"])
+    monkeypatch.setattr(connection_guard.resource, "setrlimit", lambda _, new: limits.update(now=new))
+    connection_guard.raise_descriptor_limit()
+    assert limits["now"] == (1000, 1000)
+    limits["now"] = (8192, connection_guard.resource.RLIM_INFINITY)
+    connection_guard.raise_descriptor_limit()
+    assert limits["now"][0] == 8192  # never fewer
+
+
 def test_a_full_house_is_logged_once_a_minute(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
     server = FileServer("127.0.0.1", 0, Handler())
