@@ -42,7 +42,7 @@ class PullSettings:
     patience_s : float, s
         How long to wait for a unit that went away, or that records and saves.
     max_workers : int
-        Units at a time, at most `MAX_WORKERS`: with ten chunks of 256 KiB each it bounds the memory.
+        Units at a time, at most `MAX_WORKERS`: with 2.5 MiB asked for ahead of each, it bounds the memory.
     """
 
     run_ids: list[str] | None = None
