@@ -170,3 +170,61 @@ def test_files_serve_as_well_and_movement_between_them_is_told(desk, tmp_path):
     )
     assert result.exit_code == 0, result.output
     assert [p.file for p in load_capture(tmp_path / "cal").picture] == ["z120mm.png", "z120mm_2.png"]
+
+
+def test_a_calibration_is_checked_with_pictures_taken_anyhow(desk, captured, calibration, tmp_path):
+    folder, _ = desk
+    result = run("calibrate", "check", calibration, "--captured", captured[0])
+    assert result.exit_code == 0, result.output
+    assert "The calibration holds." in result.output
+    assert "simulated" in result.output
+
+    board = ("--board", folder / "target.toml", "--picture")
+    (tmp_path / "by-hand.png").write_bytes(png(BoardPose((5, -3, 137), -70, 12, 7), seed=5))
+    result = run("calibrate", "check", calibration, *board, tmp_path / "by-hand.png")
+    assert result.exit_code == 0, result.output
+    assert "cannot be told" in result.output
+    result = run("calibrate", "check", calibration, *board, f"101.117={tmp_path / 'by-hand.png'}")
+    assert result.exit_code == 3
+    assert "the board seems to be at 13" in result.output
+
+
+@pytest.mark.parametrize(
+    ("lens", "words"),
+    [
+        # Focused nearer: all rays 0.8 % narrower. With the board square that is another depth: 129 mm.
+        ({"f_px": 0.885 * 960 * 1.008}, "the board seems to be at 128.9"),
+        # Another lens: 1 % of k1 moves the corners by 0.3 px.
+        ({"k1": -0.14}, "times what is stated"),
+    ],
+)
+def test_a_lens_that_was_changed_is_found_out(desk, calibration, tmp_path, lens, words):
+    folder, _ = desk
+    changed = picture_of_board(TARGET, camera_of(**lens), BoardPose((0, 0, 130), 180))
+    cv2.imwrite(str(tmp_path / "now.png"), changed.grey)
+    result = run(
+        "calibrate",
+        "check",
+        calibration,
+        "--board",
+        folder / "target.toml",
+        "--picture",
+        f"130={tmp_path / 'now.png'}",
+        "--board-um",
+        1,
+    )
+    assert result.exit_code == 3, result.output
+    assert words in " ".join(result.output.split())
+    assert "does not hold: calibrate again" in result.output
+
+
+def test_a_check_names_what_is_missing(desk, captured, calibration, tmp_path):
+    folder, _ = desk
+    assert "give either --captured" in run("calibrate", "check", calibration).output
+    assert (
+        "--picture not given"
+        in run("calibrate", "check", calibration, "--board", folder / "target.toml").output
+    )
+    result = run("calibrate", "check", tmp_path / "none.json", "--captured", captured[0])
+    assert result.exit_code == 1
+    assert "No such file" in result.output

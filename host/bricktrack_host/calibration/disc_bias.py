@@ -18,7 +18,12 @@ _UNIT_DISC = np.concatenate([r * np.stack([np.cos(_RING), np.sin(_RING)], axis=1
 
 
 def disc_bias_px(
-    model: RayModel, xy_mm: FloatArray, *, z_mm: float, diameter_mm: float | FloatArray
+    model: RayModel,
+    xy_mm: FloatArray,
+    *,
+    z_mm: float | FloatArray,
+    diameter_mm: float | FloatArray,
+    axes: FloatArray | None = None,
 ) -> FloatArray:
     """Return how far a disc's image centroid lies from the image of its centre.
 
@@ -26,22 +31,26 @@ def disc_bias_px(
     ----------
     model : RayModel
     xy_mm : ndarray, shape (n, 2), mm, camera frame
-        Centres of the discs, which lie in the plane z = ``z_mm``.
-    z_mm : float, mm
+        Centres of the discs.
+    z_mm : float or ndarray, shape (n,), mm
+        Their depths.
     diameter_mm : float or ndarray, shape (n,), mm
         Of all discs, or of each.
+    axes : ndarray, shape (3, 2), optional
+        Unit vectors along the discs' x and y, camera frame; square to the optical axis where not given.
 
     Returns
     -------
     shift_px : ndarray, shape (n, 2), px
         To be subtracted from measured centroids; 0 where the model cannot see the whole disc.
     """
-    points = np.full((len(xy_mm), len(_UNIT_DISC) + 1, 3), z_mm)
-    points[:, 0, :2] = xy_mm
+    axes = np.eye(3)[:, :2] if axes is None else axes
+    points = np.empty((len(xy_mm), len(_UNIT_DISC) + 1, 3))
+    points[..., :2], points[..., 2] = xy_mm[:, None], np.asarray(z_mm, dtype=np.float64).reshape(-1, 1)
     radius_mm = np.broadcast_to(np.asarray(diameter_mm, dtype=np.float64) / 2, len(xy_mm))
-    points[:, 1:, :2] = xy_mm[:, None] + radius_mm[:, None, None] * _UNIT_DISC
+    points[:, 1:] += radius_mm[:, None, None] * (_UNIT_DISC @ axes.T)
     seen = model.project(points)
-    J = seen.J_px_per_mm[:, 1:, :, :2]
+    J = seen.J_px_per_mm[:, 1:] @ axes
     scale = np.abs(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])[..., None]
     mean = (seen.uv_px[:, 1:] * scale).sum(axis=1) / scale.sum(axis=1)
     return np.asarray(np.nan_to_num(mean - seen.uv_px[:, 0]))
@@ -68,6 +77,6 @@ def disc_diameter_mm(
         Diameters in units of the one wanted, as `DotObservations` holds them.
     """
     xy = model.points_on_plane(uv_px, z_mm)
-    J = model.project(np.concatenate([xy, np.full((len(xy), 1), z_mm)], axis=1)).J_px_per_mm[..., :2]
+    J = model.project(np.concatenate([xy, np.full((len(xy), 1), float(z_mm))], axis=1)).J_px_per_mm[..., :2]
     area_mm2 = area_px2 / np.abs(np.linalg.det(J)) / np.square(size)
     return float(np.sqrt(4 / np.pi * np.nanmedian(area_mm2)))

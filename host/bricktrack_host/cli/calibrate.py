@@ -8,7 +8,7 @@ import typer
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.typed_data import load_toml
-from bricktrack_host.cli import calibrate_capture
+from bricktrack_host.cli import calibrate_capture, calibrate_check
 
 app = typer.Typer(help="Calibrate cameras from pictures of dot targets.", no_args_is_help=True)
 
@@ -205,3 +205,4 @@ def fit(
 
 
 app.command("capture")(calibrate_capture.capture)
+app.command("check")(calibrate_check.check)
