@@ -35,10 +35,15 @@ class UnitTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class StorageTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``[storage]``: where runs are kept, and how many bytes must stay free beside a run."""
+    """``[storage]``: where runs are kept, and how many bytes must stay free beside a run.
+
+    With ``delete_confirmed`` the oldest runs that a host has confirmed are deleted when the card is too full
+    to arm; otherwise none is, but by a host's command.
+    """
 
     folder: str = "/var/lib/bricktrack"
     margin_mb: Annotated[int, msgspec.Meta(ge=0)] = 256
+    delete_confirmed: bool = False
 
 
 class ServerTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True):

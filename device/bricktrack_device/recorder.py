@@ -27,6 +27,7 @@ from bricktrack_device.config import DeviceConfig
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.recording import Recording, save
 from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.retention import make_room
 from bricktrack_device.room import check_room, disk_needed_bytes
 from bricktrack_device.run_light import RunLight
 from bricktrack_device.run_store import RunStore
@@ -275,6 +276,7 @@ class Recorder:
         try:
             duration_s = duration_s or self._config.recording.duration_s
             check_monotonic_is_boottime(read_clock_triplet())
+            make_room(self._config, self._store, duration_s)
             check_room(self._config, self._store, duration_s)
             session = Session(
                 self._config,

@@ -91,6 +91,7 @@ class RunStore:
         self._disk = disk or Disk()
         self._boot = (boot_id or _kernel_boot_id()).replace("-", "")[:6]
         self._lock = threading.Lock()
+        self._files_lock = threading.Lock()
         self._lock_file: TextIO | None = None
         self._runs_known: dict[str, _KnownRun] = {}
         self._open_files: dict[tuple[str, str], int] = {}
@@ -269,7 +270,9 @@ class RunStore:
             )
         try:
             # Not mapped into memory: a card that fails then is an error here, not the end of the process.
-            return os.pread(self._descriptor(run_id, entry.name), min(length, entry.n_bytes - offset), offset)
+            with self._files_lock:
+                file = self._descriptor(run_id, entry.name)
+                return os.pread(file, min(length, entry.n_bytes - offset), offset)
         except OSError as e:
             raise RequestRefusedError(
                 "internal", f"{run_id}: {entry.name} cannot be read: {e.strerror or e}"
@@ -288,8 +291,9 @@ class RunStore:
 
     def close_files(self, run_id: str | None = None) -> None:
         """Close the files that reading left open, of one run or all."""
-        for key in [k for k in self._open_files if run_id in (None, k[0])]:
-            os.close(self._open_files.pop(key))
+        with self._files_lock:
+            for key in [k for k in self._open_files if run_id in (None, k[0])]:
+                os.close(self._open_files.pop(key))
 
     def confirm(self, run_id: str, sha256: list[str]) -> None:
         """Note that the host holds a run: the hashes, in any order, must be those of all its files.
