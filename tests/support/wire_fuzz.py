@@ -14,6 +14,7 @@ from bricktrack_common.discovery import parse_announcement
 from bricktrack_common.errors import BricktrackError, ConfigError, ProtocolError
 from bricktrack_common.key_files import check_public_key
 from bricktrack_common.wire_messages import (
+    MAX_CHUNK_BYTES,
     MAX_HEADER_BYTES,
     Arm,
     Armed,
@@ -261,8 +262,11 @@ def try_client(rng: random.Random, n: int, tally: Tally) -> None:
                 request_id, _ = decode_request(header)
                 for _ in range(16):
                     data = next(source)
-                    # Such a message ends the request, rightly; most requests shall go on to their end.
-                    while _speaks_another_version(data) and rng.random() < 0.95:
+                    # A message of another version ends the request, rightly, and one that is too long the
+                    # connection; most requests shall go on to their end.
+                    while len(data) > MAX_CHUNK_BYTES or (
+                        _speaks_another_version(data) and rng.random() < 0.95
+                    ):
                         data = next(source)
                     unit.send_multipart([identity, data, *[rng.randbytes(3)] * rng.choice([0, 0, 1, 2])])
                 unit.send_multipart([identity, encode_message(request_id, REPLIES[0])])
