@@ -26,14 +26,15 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "tests" / "support"))
 
-from light_unit import LightUnit  # noqa: E402 (the tests' support is no package)
+from light_unit import LightUnit, make_keys  # noqa: E402 (the tests' support is no package)
 from run_folders import make_run  # noqa: E402
 
 from bricktrack_host.transfer.run_transfer import pull_run  # noqa: E402
-from bricktrack_host.transfer.unit_client import UnitClient  # noqa: E402
+from bricktrack_host.transfer.unit_client import CHUNK_BYTES, UnitClient  # noqa: E402
 
 MB = 1_000_000
 RUN = "light_0001"
+PULL = "pull"
 TCP_SENDER = (
     "import socket, sys\n"
     "server = socket.create_server(('127.0.0.1', 0))\n"
@@ -76,6 +77,14 @@ def copy_by_tcp(port: int, target: Path, *, sha256: bool) -> None:
         os.fsync(file.fileno())
 
 
+def read_all(address: str, n_bytes: int) -> None:
+    """Let chunks come, checked as in a pull, and forget them: no disk, no hash, no journal."""
+    ranges = [(at, min(CHUNK_BYTES, n_bytes - at)) for at in range(0, n_bytes, CHUNK_BYTES)]
+    with UnitClient(address) as client:
+        for _ in client.read_chunks(RUN, 1, ranges):
+            pass
+
+
 def seconds(work: Callable[[], object]) -> float:
     start = time.perf_counter()
     work()
@@ -101,9 +110,19 @@ def measure(folder: Path, n_bytes: int, repeats: int) -> None:
     here = folder / "here"
     here.mkdir()
     times: dict[str, list[float]] = {}
-    with LightUnit(folder / "card") as unit, tcp_sender(source) as port:
+    unit_keys, own_keys = make_keys(folder / "keys")
+    shutil.copytree(folder / "card", folder / "card-2")
+    with (
+        LightUnit(folder / "card") as unit,
+        LightUnit(folder / "card-2", keys=folder / "keys") as locked,
+        tcp_sender(source) as port,
+    ):
         ways: dict[str, Callable[[], object]] = {
-            "pull": lambda: pull_run(lambda: UnitClient(unit.address), RUN, here),
+            PULL: lambda: pull_run(lambda: UnitClient(unit.address), RUN, here),
+            "pull with CURVE": lambda: pull_run(
+                lambda: UnitClient(locked.address, server_key=unit_keys.public, own_keys=own_keys), RUN, here
+            ),
+            "the transfer alone": lambda: read_all(unit.address, n_bytes),
             "cp, synced": lambda: copy_by_cp(source, here / "cp"),
             "TCP, synced": lambda: copy_by_tcp(port, here / "tcp", sha256=False),
             "TCP, synced and hashed": lambda: copy_by_tcp(port, here / "tcp", sha256=True),
@@ -116,8 +135,11 @@ def measure(folder: Path, n_bytes: int, repeats: int) -> None:
     print(f"{n_bytes / MB:.0f} MB over loopback, medians of {repeats} turns (simulated unit, one machine):")
     median = {way: statistics.median(spent) for way, spent in times.items()}
     for way, spent in median.items():
-        ratio = "" if way == "pull" else f"   pull is {spent / median['pull']:.2f} of its speed"
+        ratio = "" if way == PULL else f"   pull has {spent / median[PULL]:.2f} of its speed"
         print(f"  {way:24} {n_bytes / MB / spent:7.0f} MB/s{ratio}")
+    print(
+        f"CURVE costs {1e3 * (median['pull with CURVE'] - median[PULL]) / (n_bytes / MB):.2f} ms for each MB"
+    )
 
 
 if __name__ == "__main__":

@@ -10,9 +10,11 @@ import msgpack
 import numpy as np
 import pytest
 from fake_unit import FakeUnit
-from run_folders import make_run
+from light_unit import LightUnit, make_keys
+from run_folders import contents, make_run
 from typer.testing import CliRunner
 
+from bricktrack_common.key_files import make_key_pair, write_secret_key
 from bricktrack_common.wire_messages import Arm, Refusal, encode_message
 from bricktrack_host.cli import app
 
@@ -191,3 +193,38 @@ def test_status_puts_units_that_need_a_hand_first_where_not_all_fit(many):
     assert result.exit_code == 1
     assert "4 units: 3 idle, 1 fault" in result.stdout
     assert "the card is full" in " ".join(result.stdout.split())
+
+
+def test_a_unit_with_keys_is_reached_by_the_fleet_file_and_by_nobody_else(tmp_path):
+    """The real daemon (simulated sensors) with a key, asked by a host that it knows, and by others."""
+    source = make_run(tmp_path / "card" / "runs", "light_0001", {"video.h264": 700_000}, unit="light")
+    unit_keys, own_keys = make_keys(tmp_path / "keys")
+    write_secret_key(tmp_path / "known.key_secret", own_keys, what="a host")
+    write_secret_key(tmp_path / "stranger.key_secret", make_key_pair(), what="a stranger")
+
+    def fleet(secret, server_key):
+        path = tmp_path / f"{secret}.toml"
+        path.write_text(
+            f'[host]\nsecret_key = "{secret}.key_secret"\n[[unit]]\nname = "light"\n'
+            f"address = \"{unit.address}\"\nserver_key = '{server_key}'\n"
+        )
+        return path
+
+    with LightUnit(tmp_path / "card", keys=tmp_path / "keys") as unit:
+        pulled = invoke("pull", "--fleet", fleet("known", unit_keys.public), "-o", tmp_path / "runs")
+        stranger = invoke("status", "--fleet", fleet("stranger", unit_keys.public), "--timeout", 1)
+        impostor = invoke("status", "--fleet", fleet("known", make_key_pair().public), "--timeout", 1)
+        without = invoke("status", "-a", unit.address, "--timeout", 1)
+    assert pulled.exit_code == 0, pulled.stderr
+    assert contents(tmp_path / "runs" / "light_0001") == contents(source)
+    for refused in (stranger, impostor, without):
+        assert refused.exit_code == 1
+        assert "no answer" in refused.stdout
+
+
+def test_server_keys_without_a_key_of_this_host_are_an_error_of_the_fleet_file(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text(f"[[unit]]\nname = 'light'\nserver_key = '{make_key_pair().public}'\n")
+    result = invoke("status", "--fleet", path)
+    assert result.exit_code == 1
+    assert "'bricktrack keys create'" in result.stderr

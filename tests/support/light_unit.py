@@ -2,7 +2,8 @@
 
 ``python light_unit.py STORAGE`` arms itself, is triggered by a wave of its own soon after, records for half a
 second, saves and arms itself again, until it is ended. Its video has the size that a real one has.
-With ``--idle`` it only serves what is on its card; with ``--port N`` on this port.
+With ``--idle`` it only serves what is on its card; with ``--port N`` on this port; with ``--keys FOLDER`` it
+wants to know who asks.
 """
 
 import argparse
@@ -16,6 +17,13 @@ from pathlib import Path
 from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 
 from bricktrack_common.clocks import monotonic_ns
+from bricktrack_common.key_files import (
+    PUBLIC_SUFFIX,
+    KeyPair,
+    make_key_pair,
+    write_public_key,
+    write_secret_key,
+)
 from bricktrack_device.config import (
     DeviceConfig,
     ImuTable,
@@ -28,18 +36,21 @@ from bricktrack_device.config import (
 )
 from bricktrack_device.daemon import Daemon
 from bricktrack_device.sim.sim_pins import make_factory
+from bricktrack_device.unit_keys import CLIENTS_NAME, UNIT_KEY_NAME
 
 PICTURE_BYTES = 50_000  # 12 Mbit/s at 30 pictures a second
 DURATION_S = 0.5
 WAVE_HZ = 100.0
 
 
-def light_config(storage: Path, *, auto_arm: bool = True, port: int = 0) -> DeviceConfig:
+def light_config(
+    storage: Path, *, auto_arm: bool = True, port: int = 0, keys: Path | None = None
+) -> DeviceConfig:
     """Return what such a unit is told."""
     return DeviceConfig(
         unit=UnitTable(name="light"),
         storage=StorageTable(folder=str(storage), margin_mb=1),
-        server=ServerTable(port=port),
+        server=ServerTable(port=port, keys=str(keys or "")),
         trigger=TriggerTable(nominal_hz=WAVE_HZ),
         recording=RecordingTable(
             duration_s=DURATION_S, pre_roll_s=0.1, post_roll_s=0.1, auto_arm=auto_arm, label="light"
@@ -72,8 +83,9 @@ class SelfDrivenRig(FakeRig):
 class LightUnit:
     """Such a unit, idle, in its own process; it can be killed and started again on the same port."""
 
-    def __init__(self, storage: Path) -> None:
+    def __init__(self, storage: Path, *, keys: Path | None = None) -> None:
         self._storage = storage
+        self._keys = ["--keys", str(keys)] if keys else []
         self._process: subprocess.Popen[str] | None = None
         self.port = 0
 
@@ -82,7 +94,15 @@ class LightUnit:
         return f"tcp://127.0.0.1:{self.port}"
 
     def start(self) -> None:
-        command = [sys.executable, __file__, str(self._storage), "--idle", "--port", str(self.port)]
+        command = [
+            sys.executable,
+            __file__,
+            str(self._storage),
+            "--idle",
+            "--port",
+            str(self.port),
+            *self._keys,
+        ]
         self._process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         seen = []
         for line in self._process.stderr or ():
@@ -105,12 +125,22 @@ class LightUnit:
         self.kill()
 
 
+def make_keys(folder: Path) -> tuple[KeyPair, KeyPair]:
+    """Make a unit's folder of keys, which lets one host in; return the unit's pair and the host's."""
+    unit, own = make_key_pair(), make_key_pair()
+    (folder / CLIENTS_NAME).mkdir(parents=True)
+    write_secret_key(folder / UNIT_KEY_NAME, unit, what="a unit")
+    write_public_key(folder / CLIENTS_NAME / f"host{PUBLIC_SUFFIX}", own.public, what="a host")
+    return unit, own
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("storage", type=Path)
     parser.add_argument("--idle", action="store_true")
     parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--keys", type=Path)
     options = parser.parse_args()
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
-    config = light_config(options.storage, auto_arm=not options.idle, port=options.port)
+    config = light_config(options.storage, auto_arm=not options.idle, port=options.port, keys=options.keys)
     Daemon(config, SelfDrivenRig()).run()

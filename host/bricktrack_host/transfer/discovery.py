@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-SEARCH_S = 3.0
+SEARCH_S = 2.0
 """How long after the first question an answer may take; units answer within one second."""
 _RESOLVE_MS = 1000
 _TRY_S = 0.7

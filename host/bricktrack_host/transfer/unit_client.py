@@ -59,7 +59,7 @@ logger = logging.getLogger(__name__)
 
 CHUNK_BYTES = 512 * 1024
 CREDIT = 5
-"""Chunks asked for ahead: as many bytes as ten of 256 KiB, for two thirds more speed (scripts/bench_transfer.py)."""
+"""Chunks asked for ahead: the bytes of ten of 256 KiB, and two thirds faster (scripts/bench_transfer.py)."""
 _MAX_TRIES_PER_CHUNK = 4
 _POLL_MS = 200  # how soon a stop is noticed
 
