@@ -3,6 +3,11 @@
 import contextlib
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -228,3 +233,65 @@ def test_server_keys_without_a_key_of_this_host_are_an_error_of_the_fleet_file(t
     result = invoke("status", "--fleet", path)
     assert result.exit_code == 1
     assert "'bricktrack keys create'" in result.stderr
+
+
+def test_a_run_that_never_came_is_not_explained_by_another_runs_trouble(card):
+    """The unit armed itself again meanwhile, and waits for the line to go low: that says nothing of this run."""
+    with FakeUnit(card) as unit:
+
+        def arm_again():
+            while unit.state != "armed":
+                time.sleep(0.01)
+            unit.run_id, unit.reason = "fake_0009_other", "the line is high"
+
+        thread = threading.Thread(target=arm_again)
+        thread.start()
+        result = invoke("arm", "-a", unit.address, "--label", "x", "--wait")
+        thread.join()
+    assert result.exit_code == 1
+    assert "fake_0001_x was not recorded: the unit is armed for fake_0009_other now" in result.stderr
+    assert "the line is high" not in result.stderr
+
+
+@pytest.fixture
+def watcher():
+    """Start commands that go on until they are interrupted."""
+    started = []
+
+    def start(*arguments):
+        command = [sys.executable, "-m", "bricktrack_host.cli", *map(str, arguments)]
+        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def test_pull_watch_brings_each_new_run_as_it_appears(card, tmp_path, watcher):
+    later = make_run(tmp_path / "later", "fake_0003_c", {"video.h264": 5000})
+    with FakeUnit(card) as unit:
+        host = watcher(
+            "pull", "--watch", "--every", 0.2, "--json", "-a", unit.address, "-o", tmp_path / "runs"
+        )
+        first = json.loads(host.stdout.readline())
+        later.rename(card / "fake_0003_c")
+        second = json.loads(host.stdout.readline())
+        host.send_signal(signal.SIGINT)
+        assert host.wait(20) in (0, 130)  # between two pulls, or in the middle of one
+    assert [r["run_id"] for r in first["runs"]] == ["fake_0001_a", "fake_0002_b"]
+    assert [r["run_id"] for r in second["runs"]] == ["fake_0003_c"]
+    assert contents(tmp_path / "runs" / "fake_0003_c") == contents(card / "fake_0003_c")
+
+
+def test_status_watch_tells_again_and_again_and_ends_well(card, watcher):
+    with FakeUnit(card) as unit:
+        host = watcher("status", "--watch", "--every", 0.2, "--json", "-a", unit.address)
+        before = json.loads(host.stdout.readline())
+        unit.state = "armed"
+        states = [json.loads(host.stdout.readline())["units"][0]["status"]["state"] for _ in range(3)]
+        host.send_signal(signal.SIGINT)
+        assert host.wait(20) == 0
+    assert before["units"][0]["status"]["state"] == "idle"
+    assert states[-1] == "armed"

@@ -61,6 +61,8 @@ class FakeUnit:
         self.state = "idle"
         self.software = own_software()
         self.auto_arm = False
+        self.run_id = ""
+        self.reason = ""
         self.last_error = ""
         self.health: list[HealthItem] = []
         self.picture = b""
@@ -179,6 +181,7 @@ class FakeUnit:
         return StatusReply(
             unit=self.name, state=self.state, runs=len(self._folders()), disk_free_bytes=10**10,
             disk_needed_bytes=10**8, frames=0, imus=[], edges=0, health=self.health, auto_arm=self.auto_arm,
-            last_error=self.last_error, runs_unconfirmed=len(self._folders()) - len(self.confirmed),
+            last_error=self.last_error, run_id=self.run_id, reason=self.reason,
+            runs_unconfirmed=len(self._folders()) - len(self.confirmed),
             clocks=read_clock_triplet(),
         )  # fmt: skip
