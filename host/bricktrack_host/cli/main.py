@@ -6,12 +6,14 @@ from typing import Annotated
 import typer
 
 from bricktrack_host.cli import (
+    align,
     calibrate,
     calibrate_leds,
     combine,
     configure,
     delete,
     demo,
+    evaluate,
     export,
     find,
     fleet,
@@ -72,6 +74,8 @@ calibrate.app.command("leds")(calibrate_leds.leds)
 app.add_typer(calibrate.app, name="calibrate")
 app.command("process")(process.process)
 app.command("report")(process.report)
+app.command("align")(align.align)
+app.command("evaluate")(evaluate.evaluate)
 app.command("combine")(combine.combine)
 app.command("export")(export.export)
 app.command("demo")(demo.demo)

@@ -1,0 +1,155 @@
+"""``bricktrack evaluate``: the source paper's evaluation, simulated or of a recorded sweep."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from bricktrack_common.errors import ConfigError
+from bricktrack_host.cli._console import out
+from bricktrack_host.cli._progress import counting_bar
+
+if TYPE_CHECKING:
+    from bricktrack_host.evaluation.scores import SweepScore
+
+
+def evaluate(
+    run: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[RUN]", help="A processed run of a brick moved in known steps. Default: simulate."
+        ),
+    ] = None,
+    positions: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV of RUN's reference positions: start_s, end_s, x_mm, y_mm, z_mm[, rx_deg ...]."
+        ),
+    ] = None,
+    align: Annotated[
+        bool, typer.Option(help="Turn the stage's axes onto the camera's, as the displacements say.")
+    ] = True,
+    layout: Annotated[
+        Path | None,
+        typer.Option("--layout", "-l", help="Layout of the simulated brick. \\[default: the paper's]"),
+    ] = None,
+    noise_px: Annotated[
+        float,
+        typer.Option(min=0.001, max=5.0, help="Noise of simulated centroids and dots, each of u and v."),
+    ] = 0.05,
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulated lens and noise.")] = 1,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the page and its pictures.")
+    ] = Path("evaluation"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON, and nothing else.")] = False,
+) -> None:
+    """Measure known displacements and rotations, and print the errors beside the paper's and the bound.
+
+    Without RUN, a brick is simulated along the paper's sweeps (its section 6.2) with points in place of
+    pictures: from plane A to plane B in steps of 1 mm, from corner to corner, and rotations to 30 degrees
+    about each axis; then orientations to 45 degrees are identified from nothing. Rays are calibrated from
+    noisy dots of a lens that the product does not know. All figures are then simulated, and say so.
+
+    For example:
+
+        bricktrack evaluate
+
+        bricktrack evaluate --noise-px 0.1 --seed 7 --json
+
+        bricktrack evaluate runs/b2_9f31c2_0007_sweep --positions stage.csv
+    """
+    if (run is None) != (positions is None):
+        raise ConfigError("a recorded sweep needs both RUN and --positions; a simulated one neither")
+    if run is not None and positions is not None:
+        _recorded(run, positions, align=align, output=output, as_json=as_json)
+    else:
+        _simulated(layout, noise_px=noise_px, seed=seed, output=output, as_json=as_json)
+
+
+def _simulated(layout: Path | None, *, noise_px: float, seed: int, output: Path, as_json: bool) -> None:
+    from bricktrack_common.brick_model import load_brick_model
+    from bricktrack_host.evaluation.paper_brick import paper_brick
+    from bricktrack_host.evaluation.simulated_points import evaluate_points
+
+    brick = paper_brick() if layout is None else load_brick_model(layout)
+    with counting_bar("sweeps and orientations", 1) as progress:
+        found = evaluate_points(brick, noise_px=noise_px, seed=seed, progress=progress)
+    identity = (
+        f"Identity from nothing, {found.n_orientations} simulated orientations within 45 degrees: "
+        f"{found.n_right} right, {found.n_wrong} wrong, {found.n_ambiguous} reported ambiguous."
+    )
+    extra = {
+        "simulated": True,
+        "noise_px": noise_px,
+        "seed": seed,
+        "identity": {
+            "n": found.n_orientations,
+            "right": found.n_right,
+            "wrong": found.n_wrong,
+            "ambiguous": found.n_ambiguous,
+        },
+    }
+    title = f"Simulated sweeps, points with {noise_px:g} px of noise, lens {seed}"
+    _write_and_print(found.scores, title, extra, [identity], output=output, as_json=as_json, with_bound=True)
+
+
+def _recorded(run: Path, positions: Path, *, align: bool, output: Path, as_json: bool) -> None:
+    from bricktrack_common.run_manifest import MANIFEST_NAME
+    from bricktrack_host.evaluation.recorded import read_positions, score_recording
+    from bricktrack_host.pipeline import RESULTS_FOLDER
+    from bricktrack_host.results.result_store import read_result
+
+    folder = run / RESULTS_FOLDER if (run / MANIFEST_NAME).is_file() else run
+    reference = read_positions(positions)
+    result = read_result(folder)
+    score = score_recording(result.optical, reference, name=positions.stem, align=align)
+    title = f"Recorded sweep {positions.stem} of {result.manifest.run_id}"
+    extra = {"simulated": result.manifest.simulated, "run": result.manifest.run_id, "aligned": align}
+    lines = ["The stage's axes were turned onto the camera's; lengths were not scaled."] if align else []
+    if result.manifest.simulated:
+        title = f"Simulated: {title}"
+    _write_and_print([score], title, extra, lines, output=output, as_json=as_json, with_bound=False)
+
+
+def _write_and_print(
+    scores: "list[SweepScore]",
+    title: str,
+    extra: dict[str, Any],
+    lines: list[str],
+    *,
+    output: Path,
+    as_json: bool,
+    with_bound: bool,
+) -> None:
+    """Write the page and its pictures, and print the table or the JSON."""
+    from bricktrack_host.evaluation import summary
+    from bricktrack_host.evaluation.figures import errors_figure, write_page
+
+    rows = summary.summary_rows(scores, with_bound=with_bound)
+    subtitle = "Root mean squares after zeroing at the first step: displacement and rotation since then."
+    caption = (
+        "Errors along each sweep; the band is twice the Cramér-Rao bound of the axis that it binds least."
+    )
+    written = write_page(
+        output / "evaluation.html",
+        title=title,
+        subtitle=subtitle,
+        tables=[{"title": "Errors", "columns": summary.COLUMNS, "rows": rows}],
+        lines=lines,
+        figures=[(errors_figure(scores), caption if with_bound else "Errors along the sweep.")],
+    )
+    if as_json:
+        print(json.dumps({**extra, **summary.as_json(scores)}, indent=2))
+        return
+    table = Table(title=title)
+    for k, name in enumerate(summary.COLUMNS):
+        table.add_column(name, justify="left" if k == 0 else "right")
+    for row in rows:
+        table.add_row(*row, style="dim" if row[0].startswith("  ") else None)
+    out.print(table)
+    for line in lines:
+        out.print(line, markup=False)
+    for path in written:
+        out.print(f"written: {path}", markup=False, soft_wrap=True)
