@@ -1,0 +1,375 @@
+"""Poses from simulated centroids against the Cramér-Rao bound, and beside other solvers; identities; time.
+
+A lens that the solver does not know shows dots to calibrate from, and a brick in random poses. Errors are over
+the bound of each pose: 1.00 is the best that any unbiased method can do. The others get the true lens. Development
+used seed 1; the figures printed are of another seed, and so of another lens.
+
+    python scripts/bench_pose.py [--frames 100000] [--searches 200] [--seed 2]
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_host.evaluation.bound import cramer_rao_covariance
+from bricktrack_host.evaluation.paper_brick import paper_brick
+from bricktrack_host.evaluation.simulated_points import points_of
+from bricktrack_host.evaluation.true_camera import TrueCamera
+from bricktrack_host.tracking.correspondence import search_correspondence
+from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
+from bricktrack_host.tracking.optical_track import solve_poses
+from bricktrack_host.tracking.prsoi import prsoi_starts
+from bricktrack_host.tracking.refine import LedMotion, refine_poses
+from bricktrack_host.tracking.segment import Blobs
+from bricktrack_host.tracks import LedObservations
+
+NOISES_PX = (0.02, 0.05, 0.1)
+WRONG_MM = 2.0
+CHUNK = 5000
+OTHERS = 2000  # frames that the other solvers get: they take one at a time
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--frames", type=int, default=100_000)
+    parser.add_argument("--searches", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=2)
+    args = parser.parse_args()
+    brick = paper_brick()
+    camera = TrueCamera.of_seed(args.seed)
+    print(f"All figures simulated. Lens and noise of seed {args.seed}; {args.frames} random poses.\n")
+    print(
+        "RMSE over the bound                     rot x  rot y  rot z      x      y      z   failed   NEES/6"
+    )
+    for noise in NOISES_PX:
+        rng = np.random.default_rng([args.seed, round(1000 * noise)])
+        rays = camera.calibrated(noise_px=noise, rng=rng)
+        ours, raw = Tally(), Tally()
+        left = args.frames
+        while left > 0:
+            n = min(CHUNK, left)
+            left -= n
+            scene = Scene.random(n, brick, camera, noise, rng)
+            R, t = prsoi_starts(scene.uv, rays, scene.points)
+            raw.add(scene, R, t, None)
+            fitted = refine_poses(
+                scene.uv, scene.cov, R, t, rays, scene.points, collar_mm=0.0, profile_is_exact=True
+            )
+            ours.add(scene, fitted.R_camera_brick, fitted.t_camera_brick_mm, fitted.covariance)
+        print(f"{noise:4.2f} px  PRSOI and refinement, dots   {ours}")
+        print(f"         PRSOI alone, dots            {raw}")
+        few = Scene.random(OTHERS, brick, camera, noise, rng)
+        for name, solve in other_solvers().items():
+            tally = Tally()
+            R, t = each(few, camera, solve)
+            tally.add(few, R, t, None)
+            print(f"         {name:28s} {tally}")
+    identities(args.searches, args.seed, brick, camera)
+    moving(args.seed, brick, camera)
+    timed(args.seed, brick, camera)
+    return 0
+
+
+class Scene:
+    """Random poses of a brick whose LEDs are points, and what the camera shows of them."""
+
+    def __init__(
+        self, R: FloatArray, t: FloatArray, brick: BrickModel, camera: TrueCamera, noise_px: float
+    ) -> None:
+        self.R, self.t, self.brick, self.noise_px = R, t, brick, noise_px
+        self.points = points_of(brick)
+        self.camera = camera
+        self.uv_true = camera.project(np.einsum("nij,lj->nli", R, brick.led_positions_mm) + t[:, None])
+        self.cov = np.tile(noise_px**2 * np.eye(2), (len(R), brick.n_leds, 1, 1))
+        self.uv = self.uv_true
+
+    @classmethod
+    def random(
+        cls, n: int, brick: BrickModel, camera: TrueCamera, noise_px: float, rng: np.random.Generator
+    ) -> "Scene":
+        """Draw poses within 25 degrees of facing the camera, all LEDs in the picture."""
+        middle = 0.5 * (brick.led_positions_mm.min(axis=0) + brick.led_positions_mm.max(axis=0))
+        R, t = np.empty((0, 3, 3)), np.empty((0, 3))
+        while len(R) < n:
+            axis = rng.normal(size=(n, 3))
+            axis *= np.radians(rng.uniform(0, 25, (n, 1))) / np.linalg.norm(axis, axis=1, keepdims=True)
+            turn = matrix_from_rvec(axis)
+            place = np.column_stack(
+                [rng.uniform(-18, 18, n), rng.uniform(-8, 8, n), rng.uniform(112, 155, n)]
+            )
+            shift = place - turn @ middle
+            drawn = cls(turn, shift, brick, camera, noise_px)
+            whole = camera.sees(drawn.uv_true).all(axis=1)
+            R, t = np.concatenate([R, turn[whole]]), np.concatenate([t, shift[whole]])
+        scene = cls(R[:n], t[:n], brick, camera, noise_px)
+        scene.uv = scene.uv_true + rng.normal(0, noise_px, scene.uv_true.shape)
+        return scene
+
+    def bound(self, seen: BoolArray | None = None) -> FloatArray:
+        """Return the Cramér-Rao bound, (n, 6, 6)."""
+        seen = np.ones(self.uv.shape[:2], dtype=bool) if seen is None else seen
+        return cramer_rao_covariance(
+            self.camera.project, self.R, self.t, self.brick.led_positions_mm, seen, noise_px=self.noise_px
+        )
+
+
+class Tally:
+    """Sums of squared errors over the bound, failures, and normalised squared errors."""
+
+    def __init__(self) -> None:
+        self.squares, self.n, self.failed, self.nees = np.zeros(6), 0, 0, 0.0
+        self.has_covariance = False
+
+    def add(self, scene: Scene, R: FloatArray, t: FloatArray, covariance: FloatArray | None) -> None:
+        """Count poses; one that is missing or wrong by millimetres is a failure and no error."""
+        distance = np.linalg.norm(t - scene.t, axis=1)
+        good = np.isfinite(distance) & (distance < WRONG_MM + 200 * scene.noise_px)
+        self.failed += int((~good).sum())
+        turn = rvec_from_matrix(np.swapaxes(R[good], -1, -2) @ scene.R[good])
+        error = np.concatenate([turn, (scene.t - t)[good]], axis=1)
+        variance = np.einsum("nii->ni", scene.bound()[good])
+        self.squares += np.sum(error**2 / variance, axis=0)
+        self.n += int(good.sum())
+        if covariance is not None:
+            self.has_covariance = True
+            self.nees += float(np.einsum("ni,nij,nj->", error, np.linalg.inv(covariance[good]), error))
+
+    def __str__(self) -> str:
+        ratio = np.sqrt(self.squares / max(self.n, 1))
+        nees = f"{self.nees / self.n / 6:8.3f}" if self.has_covariance else "       -"
+        return "  ".join(f"{r:5.3f}" for r in ratio) + f"  {self.failed:7d} {nees}"
+
+
+Solver = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray] | None]
+"""LEDs (n, 3), mm, and their true slopes x/z, y/z (n, 2) -> R and t, or None."""
+
+
+def other_solvers() -> dict[str, Solver]:
+    """Return OpenCV's solvers and, where installed, PoseLib's."""
+    unit = np.eye(3)
+
+    def refined(p: FloatArray, s: FloatArray, ok: bool, r: FloatArray, t: FloatArray) -> bool:
+        if ok:
+            cv2.solvePnPRefineLM(p, s, unit, None, r, t)
+        return ok
+
+    def opencv(flag: int, *, then_lm: bool) -> Solver:
+        def solve(p: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+            use = slice(None)
+            if flag == cv2.SOLVEPNP_IPPE:  # planar points only: the six that are, then all by LM
+                use = np.flatnonzero(np.abs(p[:, 2]) < 1e-6)
+            try:
+                ok, r, t = cv2.solvePnP(p[use], s[use], unit, None, flags=flag)
+            except cv2.error:
+                return None
+            if then_lm:
+                refined(p, s, ok, r, t)
+            return (cv2.Rodrigues(r)[0], t.ravel()) if ok else None
+
+        return solve
+
+    solvers = {
+        "OpenCV SQPNP": opencv(cv2.SOLVEPNP_SQPNP, then_lm=False),
+        "OpenCV EPNP": opencv(cv2.SOLVEPNP_EPNP, then_lm=False),
+        "OpenCV IPPE, LM": opencv(cv2.SOLVEPNP_IPPE, then_lm=True),
+    }
+    try:
+        import poselib
+    except ImportError:
+        print("PoseLib is not installed (pip install poselib): left out", file=sys.stderr)
+        return solvers
+    focal = 1600.0  # its thresholds are in pixels
+    model = {"model": "SIMPLE_PINHOLE", "width": 1920, "height": 1080, "params": [focal, 0.0, 0.0]}
+
+    def by_poselib(p: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        options = {"max_reproj_error": 5.0, "max_error": 5.0}
+        pose, _ = poselib.estimate_absolute_pose(list(s * focal), list(p), model, options, {})
+        return np.asarray(pose.R), np.asarray(pose.t)
+
+    solvers["PoseLib"] = by_poselib
+    return solvers
+
+
+def each(scene: Scene, camera: TrueCamera, solve: Solver) -> tuple[FloatArray, FloatArray]:
+    """Solve frame by frame with the true lens taken off."""
+    n = len(scene.R)
+    R, t = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
+    slopes = true_slopes(camera, scene.uv)
+    for i in range(n):
+        found = solve(scene.brick.led_positions_mm, slopes[i])
+        if found is not None:
+            R[i], t[i] = found
+    return R, t
+
+
+def true_slopes(camera: TrueCamera, uv: FloatArray) -> FloatArray:
+    """Invert the true lens by Newton's method with differences, to 1e-12."""
+    s = (uv - [camera.cx_px, camera.cy_px]) / camera.focal_px
+
+    def at(slopes: FloatArray) -> FloatArray:
+        return camera.project(np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1))
+
+    for _ in range(6):
+        h = 1e-5
+        J = np.stack([(at(s + h * e) - at(s - h * e)) / (2 * h) for e in np.eye(2)], axis=-1)
+        s = s + np.linalg.solve(J, (uv - at(s))[..., None])[..., 0]
+    return s
+
+
+def identities(n: int, seed: int, brick: BrickModel, camera: TrueCamera) -> None:
+    """Print how identities from nothing come out with LEDs hidden and five false lights."""
+    rng = np.random.default_rng([seed, 7])
+    rays = camera.calibrated(noise_px=0.05, rng=rng)
+    print(
+        f"\nIdentity from nothing, five false lights, 0.05 px, {n} frames each; 'wrong' after the pose's outliers"
+    )
+    print("hidden  all right   some missing   ambiguous   wrong   ms a frame")
+    for n_hidden in (0, 1, 2):
+        scene = Scene.random(n, brick, camera, 0.05, rng)
+        counts = {"right": 0, "missing": 0, "ambiguous": 0, "wrong": 0}
+        start = time.process_time()
+        for i in range(n):
+            counts[search_one(scene, i, n_hidden, rays, rng)] += 1
+        ms = 1e3 * (time.process_time() - start) / n
+        shares = [counts[k] / n for k in ("right", "missing", "ambiguous")]
+        print(
+            f"{n_hidden:6d}  "
+            + "  ".join(f"{100 * s:9.2f} %" for s in shares)
+            + f"  {counts['wrong']:6d}  {ms:9.1f}"
+        )
+
+
+def search_one(scene: Scene, i: int, n_hidden: int, rays: RayModel, rng: np.random.Generator) -> str:
+    """Return what became of one frame: "right", "missing", "ambiguous" or "wrong"."""
+    brick, n_leds = scene.brick, scene.brick.n_leds
+    shown = np.sort(rng.permutation(n_leds)[n_hidden:])
+    false = rng.uniform([20, 20], [1900, 1060], (5, 2))
+    z = (brick.led_positions_mm @ scene.R[i].T + scene.t[i])[shown, 2]
+    area = (
+        np.pi * (brick.led_radii_mm[shown] * scene.camera.focal_px / z) ** 2 * rng.uniform(0.6, 1.0, len(z))
+    )
+    area = np.concatenate([area, np.exp(rng.uniform(np.log(900), np.log(6000), 5))])
+    uv = np.concatenate([scene.uv[i, shown], false])
+    order = rng.permutation(len(uv))
+    truth = np.full(n_leds, -1)
+    truth[shown] = np.argsort(order)[: len(shown)]
+    n = len(uv)
+    blobs = Blobs(
+        uv_px=uv[order],
+        cov_px2=np.tile(scene.noise_px**2 * np.eye(2), (n, 1, 1)),
+        area_px2=area[order],
+        eccentricity=np.zeros(n),
+        fill=np.ones(n),
+        flags=np.zeros(n, dtype=np.int64),
+    )
+    found = search_correspondence(blobs, rays, brick, collar_mm=None)
+    said = found.blob_of_led
+    if found.is_ambiguous:
+        return "ambiguous"
+    if (said >= 0).sum() > 4:  # as the product goes on: a pose, and its outliers are not used
+        seen = np.where((said >= 0)[:, None], blobs.uv_px[np.maximum(said, 0)], np.nan)
+        said = np.where(np.isfinite(used_in_pose(seen, rays, scene)), said, -1)
+    if ((said >= 0) & (said != truth)).any():
+        return "wrong"
+    return "right" if (said == truth).all() else "missing"
+
+
+def used_in_pose(uv: FloatArray, rays: RayModel, scene: Scene) -> FloatArray:
+    """Return the residual's u of the LEDs that the product's pose uses, NaN for others."""
+    track = solve_poses(observed(uv[None], scene), rays, scene.points, rolling_shutter=False)
+    return track.residual_px[0, :, 0]
+
+
+def observed(uv: FloatArray, scene: Scene, step_ns: int = 33_327_000) -> LedObservations:
+    n, n_leds = uv.shape[:2]
+    missing = ~np.isfinite(uv[..., 0])
+    return LedObservations(
+        sensor_timestamp_ns=np.arange(n, dtype=np.int64) * step_ns + 10**12,
+        exposure_ns=np.full(n, 2_000_000, dtype=np.int64),
+        uv_px=uv,
+        cov_px2=np.tile(scene.noise_px**2 * np.eye(2), (n, n_leds, 1, 1)),
+        area_px2=np.full((n, n_leds), np.nan),
+        led_flags=missing.astype(np.int64),
+        frame_flags=np.zeros(n, dtype=np.int64),
+    )
+
+
+def moving(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
+    """Print errors of a brick swinging at 0.3 m/s, read out in 20 ms: row times taken, and not."""
+    rng = np.random.default_rng([seed, 9])
+    noise, n = 0.05, 900
+    rays = camera.calibrated(noise_px=noise, rng=rng)
+    mode = camera.mode
+    frame_s = np.arange(n) * 33.327e-3
+    middle = 0.5 * (brick.led_positions_mm.min(axis=0) + brick.led_positions_mm.max(axis=0))
+    omega = 2 * np.pi * 4.0  # 4 Hz, 12 mm: 0.3 m/s along x and half of it along y and z
+
+    def pose(t_s: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
+        wave = np.stack(
+            [np.sin(omega * t_s), 0.5 * np.sin(omega * t_s + 1), 0.5 * np.sin(omega * t_s + 2)], axis=-1
+        )
+        R = matrix_from_rvec(np.radians(2.0) * share * wave[..., [1, 2, 0]])
+        return R, np.array([0.0, 0.0, 134.0]) + 12.0 * share * wave - R @ middle
+
+    print("\nMoving at up to 0.3 m/s, 4 Hz, 20 ms read-out, 0.05 px: root mean square errors")
+    print("                       x      y      z mm    deg")
+    for name, share, rows in (("at rest", 0.0, True), ("row times", 1.0, True), ("one instant", 1.0, False)):
+        at_frame = pose(frame_s, share)
+        scene = Scene(*at_frame, brick, camera, noise)
+        # Each LED is seen when its own row is: a fixed point, a few rounds settle it.
+        led_s = np.repeat(frame_s[:, None], brick.n_leds, axis=1)
+        for _ in range(20):
+            R, t = pose(led_s, share)
+            uv = camera.project(np.einsum("nlij,lj->nli", R, brick.led_positions_mm) + t)
+            led_s = frame_s[:, None] + (uv[..., 1] - 0.5 * (mode.height - 1)) * mode.line_time_ns * 1e-9
+        uv = uv + rng.normal(0, noise, uv.shape)
+        track = solve_poses(observed(uv, scene), rays, scene.points, rolling_shutter=rows)
+        inner = slice(5, -5)  # the ends know one neighbour only
+        error = (track.t_camera_brick_mm - scene.t)[inner]
+        turn = rvec_from_matrix(np.swapaxes(track.R_camera_brick[inner], -1, -2) @ scene.R[inner])
+        rms = np.sqrt(np.mean(error**2, axis=0))
+        deg = np.degrees(np.sqrt(np.mean(np.sum(turn**2, axis=1))))
+        whole = np.concatenate([turn, -error], axis=1)
+        nees = np.einsum("ni,nij,nj->n", whole, np.linalg.inv(track.covariance[inner]), whole).mean() / 6
+        print(f"{name:20s} " + "  ".join(f"{x:5.3f}" for x in rms) + f"     {deg:5.3f}   NEES/6 {nees:5.2f}")
+
+
+def timed(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
+    """Print processor time a frame of the batch's parts."""
+    rng = np.random.default_rng([seed, 8])
+    rays = camera.calibrated(noise_px=0.05, rng=rng)
+    scene = Scene.random(20_000, brick, camera, 0.05, rng)
+    R, t = prsoi_starts(scene.uv, rays, scene.points)
+    still = LedMotion(np.zeros((20_000, 7, 3)), np.zeros((20_000, 7, 3)), np.zeros((20_000, 7)))
+    parts: dict[str, Callable[[], object]] = {
+        "rays of the pixels": lambda: expand_at(hit_polynomials(rays), scene.uv),
+        "rays and PRSOI": lambda: prsoi_starts(scene.uv, rays, scene.points),
+        "refinement, with rays": lambda: refine_poses(
+            scene.uv, scene.cov, R, t, rays, scene.points, collar_mm=0.0, profile_is_exact=True
+        ),
+        "  with LED motion": lambda: refine_poses(
+            scene.uv, scene.cov, R, t, rays, scene.points, collar_mm=0.0, profile_is_exact=True, motion=still
+        ),
+    }
+    print("\nProcessor time, batch of 20,000 frames, best of three")
+    for name, run in parts.items():
+        best = np.inf
+        for _ in range(3):
+            start = time.process_time()
+            run()
+            best = min(best, time.process_time() - start)
+        print(f"{name:24s} {best / len(scene.R) * 1e6:7.2f} us a frame")
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parent))
+    sys.exit(main())
