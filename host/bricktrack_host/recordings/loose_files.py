@@ -105,7 +105,7 @@ def read_imu_csv(path: Path) -> LooseImu:
     RunFormatError
         If a column is missing, a field is no number, or times do not increase.
     """
-    header, rows = _read_csv(path)
+    header, rows = read_csv_rows(path)
     gyro_unit = next((u for u, names in _GYRO_COLUMNS.items() if set(names) <= set(header)), None)
     wanted = ["t_ns", *_ACC_COLUMNS, *_GYRO_COLUMNS[gyro_unit or "dps"]]
     missing = [c for c in wanted if c not in header]
@@ -115,8 +115,8 @@ def read_imu_csv(path: Path) -> LooseImu:
             f"az_mps2, gx_dps, gy_dps and gz_dps (or g?_radps), and names {', '.join(header)}"
         )
     columns = [header.index(c) for c in wanted]
-    t_ns = _times_ns(path, [(n, row[columns[0]]) for n, row in rows])
-    values = np.array([[_number(path, n, row[c]) for c in columns[1:]] for n, row in rows])
+    t_ns = read_times_ns(path, [(n, row[columns[0]]) for n, row in rows])
+    values = np.array([[read_number(path, n, row[c]) for c in columns[1:]] for n, row in rows])
     values[~np.isfinite(values).all(axis=1)] = np.nan
     gyro = np.rad2deg(values[:, 3:]) if gyro_unit == "radps" else values[:, 3:]
     return LooseImu(t_ns, values[:, :3], gyro)
@@ -124,14 +124,15 @@ def read_imu_csv(path: Path) -> LooseImu:
 
 def read_edges_csv(path: Path) -> IntArray:
     """Return the rising edges in the column ``t_ns`` of a CSV file, int64 ns, strictly increasing."""
-    header, rows = _read_csv(path)
+    header, rows = read_csv_rows(path)
     if "t_ns" not in header:
         raise RunFormatError(f"{path}: no column t_ns; the first line names {', '.join(header)}")
     column = header.index("t_ns")
-    return _times_ns(path, [(n, row[column]) for n, row in rows])
+    return read_times_ns(path, [(n, row[column]) for n, row in rows])
 
 
-def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+def read_csv_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the column names and, with their line numbers, the rows; empty lines and comments left out."""
     reader = csv.reader(_read_text(path, RunFormatError).splitlines())
     header: list[str] = []
     rows: list[tuple[int, list[str]]] = []
@@ -151,7 +152,8 @@ def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     return header, rows
 
 
-def _times_ns(path: Path, fields: list[tuple[int, str]]) -> IntArray:
+def read_times_ns(path: Path, fields: list[tuple[int, str]]) -> IntArray:
+    """Return whole nanoseconds from (line number, text), which must increase."""
     t_ns = np.empty(len(fields), dtype=np.int64)
     for i, (n, text) in enumerate(fields):
         # Never by float: ns since boot need more than the 53 bits of one.
@@ -163,7 +165,8 @@ def _times_ns(path: Path, fields: list[tuple[int, str]]) -> IntArray:
     return t_ns
 
 
-def _number(path: Path, line: int, text: str) -> float:
+def read_number(path: Path, line: int, text: str) -> float:
+    """Return a number, NaN where the field is empty."""
     if not text.strip():
         return float("nan")
     try:
