@@ -36,7 +36,7 @@ from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.recordings.video_frames import decode_run_video
 from bricktrack_host.reporting.plots import CalibrationPicture, FrameOverlay
-from bricktrack_host.reporting.report import ReportExtras, write_report
+from bricktrack_host.reporting.report import ReportExtras, render_report
 from bricktrack_host.reporting.report_pictures import PICTURES_NAME, save_pictures
 from bricktrack_host.results.daq_clock import EdgeFit, EdgeFitError, fit_edges
 from bricktrack_host.results.rest_pose import RestPose, tare
@@ -226,17 +226,19 @@ def process_run(
         timings_s=stages.seconds,
     )
     results_folder = output or folder / RESULTS_FOLDER
-    with stages("write tables"):
-        write_results(result, results_folder)
     with stages("write report"):
         comparison = _compare(result, folder, truth)
         overlays, covered = pictures.overlays(observations, optical), _calibration_picture(rays)
-        save_pictures(results_folder / PICTURES_NAME, overlays, covered)
-        extras = ReportExtras(overlays=overlays, calibration=covered, truth=comparison)
-        report = results_folder / REPORT_NAME
-        write_report(result, report, extras)
+        page = render_report(result, ReportExtras(overlays=overlays, calibration=covered, truth=comparison))
+    with stages("write tables"):
+
+        def write_page(partial: Path) -> None:
+            save_pictures(partial / PICTURES_NAME, overlays, covered)
+            (partial / REPORT_NAME).write_text(page, encoding="utf-8")
+
+        write_results(result, results_folder, also=write_page)
     logger.info("%s: processed in %.1f s", folder.name, sum(stages.seconds.values()))
-    return ProcessedRun(result, results_folder, report, comparison)
+    return ProcessedRun(result, results_folder, results_folder / REPORT_NAME, comparison)
 
 
 def observe_run(

@@ -1,7 +1,8 @@
 """``bricktrack process`` and ``bricktrack report``: runs into results, and results into a page."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -20,8 +21,10 @@ from bricktrack_host.transfer.pull import PulledRun
 # What computes is imported by the command that runs it: OpenCV, SciPy, PyArrow and matplotlib take seconds
 # to load, and `--help`, `status` and `pull` need none of them.
 if TYPE_CHECKING:
-    from bricktrack_host.pipeline import ProcessedRun
+    from bricktrack_host.pipeline import ProcessedRun, ProcessProgress, ProcessSettings
     from bricktrack_host.results.truth import TruthComparison
+
+_PIPELINE = "bricktrack_host.pipeline"
 
 CalibrationOption = Annotated[
     Path | None,
@@ -51,17 +54,24 @@ class _StageBar:
     def advance_to(self, done: int) -> None:
         self._progress.update(self._task, completed=done)
 
+    def remove(self) -> None:
+        self._progress.remove_task(self._task)
 
-@contextmanager
-def stage_bar(run_id: str) -> Iterator[_StageBar]:
-    """Show the progress of one run on the terminal while the block runs."""
+
+def _bars() -> Progress:
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=err, transient=True) as progress:
+    return Progress(*columns, console=err, transient=True)
+
+
+@contextmanager
+def stage_bar(run_id: str) -> Iterator[_StageBar]:
+    """Show the progress of one run on the terminal while the block runs."""
+    with _bars() as progress:
         yield _StageBar(progress, run_id)
 
 
@@ -89,18 +99,26 @@ def process(
     use_imu: Annotated[
         bool, typer.Option("--use-imu/--no-imu", help="Fuse with the IMU, or smooth the optical poses alone.")
     ] = True,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs", "-j", min=1, help="Runs at once. \\[default: as processors and free memory allow]"
+        ),
+    ] = None,
 ) -> None:
     """Turn recordings into motion: poses, tables (Parquet and CSV) and a report in each run's folder.
 
-    A run processed again gives the same numbers. Exits with 1 if a run could not be processed.
+    A run processed again gives the same numbers. Several runs are processed side by side, each in a process
+    of its own; one that fails does not stop the others. Exits with 1 if a run could not be processed. Ctrl-C
+    leaves each run's earlier results, or its new ones, whole.
 
     For example:
 
         bricktrack process runs/b2_9f31c2_0007_shake --calibration b2.json --layout brick.toml
 
-        bricktrack process runs/b2_* --fleet fleet.toml
+        bricktrack process runs/b2_* --fleet fleet.toml --jobs 4
     """
-    from bricktrack_host.pipeline import ProcessSettings, process_run
+    from bricktrack_host.pipeline import ProcessSettings
 
     if output is not None and len(runs) > 1:
         raise ConfigError(
@@ -113,25 +131,72 @@ def process(
         imu=imu,
         use_imu=use_imu,
     )
-    failed = 0
+    wanted = partial(_process_one, output=output, settings=settings, truth=truth)
+    if len(runs) == 1:
+        files = _files_for(runs[0], calibration, layout, fleet)
+        with stage_bar(runs[0].name) as bar:
+            processed = wanted(runs[0], files, bar)
+        say_processed(processed)
+        return
+    ready: list[tuple[Path, tuple[Path, Path]]] = []
     for run in runs:
         try:
-            unit_files = _files_for(run, calibration, layout, fleet)
-            with stage_bar(run.name) as bar:
-                processed = process_run(
-                    run, calibration=unit_files[0], layout=unit_files[1], output=output, settings=settings,
-                    truth=truth, progress=bar,
-                )  # fmt: skip
+            ready.append((run, _files_for(run, calibration, layout, fleet)))
         except BricktrackError as e:
-            if len(runs) == 1:
-                raise
             say_error(f"{run}: {e}")
-            failed += 1
-            continue
-        say_processed(processed)
+    failed = len(runs) - len(ready) + _process_many(ready, wanted, jobs)
     if failed:
         say_error(f"{failed} of {len(runs)} runs could not be processed")
         raise typer.Exit(EXIT_ERROR)
+
+
+def _process_one(
+    run: Path,
+    files: tuple[Path, Path],
+    progress: "ProcessProgress",
+    *,
+    output: Path | None,
+    settings: "ProcessSettings",
+    truth: Path | None,
+) -> "ProcessedRun":
+    from bricktrack_host.pipeline import process_run
+
+    return process_run(
+        run, calibration=files[0], layout=files[1], output=output, settings=settings, truth=truth,
+        progress=progress,
+    )  # fmt: skip
+
+
+def _process_many(
+    ready: list[tuple[Path, tuple[Path, Path]]], wanted: "Callable[..., ProcessedRun]", jobs: int | None
+) -> int:
+    """Process runs side by side, say what became of each as it ends, and return how many failed."""
+    from bricktrack_host.many_runs import default_workers, process_side_by_side
+
+    works = [partial(wanted, run, files) for run, files in ready]
+    bars: dict[int, _StageBar] = {}
+    failed = 0
+    with _bars() as progress:
+
+        def begin(i: int) -> _StageBar:
+            bars[i] = _StageBar(progress, ready[i][0].name)
+            return bars[i]
+
+        outcomes = process_side_by_side(
+            works, workers=jobs or default_workers(len(works)), progress=begin, preload=[_PIPELINE]
+        )
+        with closing(outcomes):
+            for outcome in outcomes:
+                bars[outcome.index].remove()
+                run = ready[outcome.index][0]
+                if outcome.value is not None:
+                    say_processed(outcome.value, budget=False)
+                    continue
+                failed += 1
+                if outcome.is_bug:
+                    err.print(outcome.failure, markup=False, soft_wrap=True)
+                say_error(f"{run}: {'a bug, see above' if outcome.is_bug else outcome.failure}")
+    return failed
 
 
 def process_pulled(unit: UnitConfig, pulled: PulledRun) -> None:
@@ -213,7 +278,7 @@ def _files_for(
     return found[0], found[1]
 
 
-def say_processed(processed: "ProcessedRun") -> None:
+def say_processed(processed: "ProcessedRun", *, budget: bool = True) -> None:
     """Print the verdict, the errors against truth where there is one, the time budget and where it all is."""
     from bricktrack_host.results.run_summary import key_figures, verdict
 
@@ -223,18 +288,22 @@ def say_processed(processed: "ProcessedRun") -> None:
     for problem in problems:
         out.print(f"  {problem}", style="yellow", markup=False, soft_wrap=True)
     say_truth(processed.truth)
+    if budget:
+        _say_budget(result.timings_s, len(result.optical.t_ns))
+    out.print(f"results: {processed.folder}", markup=False, soft_wrap=True)
+    out.print(f"report:  {processed.report}", markup=False, soft_wrap=True)
+
+
+def _say_budget(timings_s: dict[str, float], n_frames: int) -> None:
     table = Table(title="Time budget")
     table.add_column("stage")
     table.add_column("s", justify="right")
     table.add_column("ms a frame", justify="right")
-    n_frames = len(result.optical.t_ns)
-    for name, seconds in result.timings_s.items():
+    for name, seconds in timings_s.items():
         table.add_row(name, f"{seconds:.2f}", f"{1000 * seconds / n_frames:.2f}")
-    total = sum(result.timings_s.values())
+    total = sum(timings_s.values())
     table.add_row("all", f"{total:.2f}", f"{1000 * total / n_frames:.2f}", style="bold")
     out.print(table)
-    out.print(f"results: {processed.folder}", markup=False, soft_wrap=True)
-    out.print(f"report:  {processed.report}", markup=False, soft_wrap=True)
 
 
 def say_truth(comparison: "TruthComparison | None") -> None:

@@ -5,6 +5,7 @@ processed again gives the same bytes.
 """
 
 import importlib.metadata
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -152,7 +153,7 @@ def software_version() -> str:
     return importlib.metadata.version("bricktrack")
 
 
-def write_results(result: RunResult, folder: Path) -> None:
+def write_results(result: RunResult, folder: Path, *, also: Callable[[Path], None] | None = None) -> None:
     """Write a run's results, replacing a folder of an earlier processing.
 
     The folder is written whole or not at all; see `write_folder_whole`.
@@ -162,13 +163,21 @@ def write_results(result: RunResult, folder: Path) -> None:
     result : RunResult
     folder : Path
         As ``<run folder>/results``.
+    also : callable, optional
+        Writes more files into the folder that it is given, before that takes its name.
 
     Raises
     ------
     StorageError
         If the folder exists and holds something else than results, or cannot be written.
     """
-    write_folder_whole(folder, lambda partial: _write_files(result, partial), marker=SUMMARY_NAME)
+
+    def write(partial: Path) -> None:
+        _write_files(result, partial)
+        if also is not None:
+            also(partial)
+
+    write_folder_whole(folder, write, marker=SUMMARY_NAME)
 
 
 def _write_files(result: RunResult, folder: Path) -> None:
