@@ -35,6 +35,7 @@ class StoreHandler:
     def __init__(self, store):
         self.store = store
         self.busy = False
+        self.is_busy = False
 
     def handle(self, request, answer):
         match request:

@@ -49,20 +49,19 @@ class _Bars:
     def __init__(self, progress: Progress, n_units: int) -> None:
         self._progress = progress
         self._n_units, self._n_done, self._total = n_units, 0, 0
+        self._waiting: dict[str, tuple[str, int]] = {}
         self._bars: dict[str, TaskID] = {}
         self._all: TaskID | None = progress.add_task("all units", total=0) if n_units > 1 else None
 
-    def unit_started(self, unit: str) -> None:
-        """Show nothing: most units have nothing new when they are watched."""
-
     def unit_listed(self, unit: str, n_runs: int, n_bytes: int) -> None:
-        if not n_runs:
-            return
-        words = f"{unit}: {n_runs} run{'' if n_runs == 1 else 's'}"
-        self._bars[unit] = self._progress.add_task(words, total=n_bytes)
+        self._waiting[unit] = (f"{unit}: {n_runs} run{'' if n_runs == 1 else 's'}", n_bytes)
         self._total += n_bytes
         if self._all is not None:
             self._progress.update(self._all, total=self._total)
+
+    def unit_started(self, unit: str) -> None:
+        words, n_bytes = self._waiting.pop(unit)
+        self._bars[unit] = self._progress.add_task(words, total=n_bytes)
 
     def bytes_done(self, unit: str, n_bytes: int) -> None:
         self._progress.advance(self._bars[unit], n_bytes)

@@ -9,12 +9,12 @@ logger = logging.getLogger(__name__)
 class PullProgress(Protocol):
     """Hears how a pull goes; called from several threads."""
 
-    def unit_started(self, unit: str) -> None:
-        """Hear that a unit has its turn."""
-        ...
-
     def unit_listed(self, unit: str, n_runs: int, n_bytes: int) -> None:
         """Hear how much a unit has that is not here yet."""
+        ...
+
+    def unit_started(self, unit: str) -> None:
+        """Hear that a unit has its turn."""
         ...
 
     def bytes_done(self, unit: str, n_bytes: int) -> None:
