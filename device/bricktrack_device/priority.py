@@ -9,7 +9,9 @@ NICENESS = 10
 
 def lower_priority() -> None:
     """Let all ordinary threads go before the calling one; on Linux, niceness belongs to a thread."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+    thread = threading.get_native_id()
+    if os.getpriority(os.PRIO_PROCESS, thread) < NICENESS:  # the way back is for root alone
+        os.setpriority(os.PRIO_PROCESS, thread, NICENESS)
 
 
 def at_low_priority(action: Callable[[], None]) -> None:

@@ -10,6 +10,7 @@ from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.checksums import crc32
 from bricktrack_common.run_manifest import CameraSection
 from bricktrack_device import still as still_module
+from bricktrack_device.backends import open_rig
 from bricktrack_device.config import DeviceConfig, LedsTable
 from bricktrack_device.interfaces import Still
 from bricktrack_device.refusals import RequestRefusedError
@@ -89,6 +90,23 @@ def test_a_camera_without_pictures_and_one_that_does_not_start_are_refused_with_
     broken = FakeRig(camera=FakeCamera(fail="no ribbon"))
     with pytest.raises(RequestRefusedError, match="no picture: no ribbon"):
         take_still(DeviceConfig(), broken, lit=True, beat=lambda: None)
+
+
+def test_the_simulated_camera_gives_a_picture_with_its_leds() -> None:
+    config = DeviceConfig(backend="sim", leds=LedsTable(pins=["GPIO22"]))
+    bright = {}
+    for lit in (True, False):
+        rig = open_rig(config)
+        try:
+            taken = take_still(config, rig, lit=lit, beat=lambda: None)
+        finally:
+            rig.close()
+        image, data = encode_still(taken, "png", simulated=True)
+        assert (image.width_px, image.height_px, image.lit) == (1920, 1080, lit)
+        assert image.mode == taken.section.mode.name and image.exposure_us == taken.section.exposure_us
+        bright[lit] = int((decoded(data, "gray") > 200).sum())
+    # Seven LEDs of 60 to 75 px across, by the pinhole formula; the rings in the view shine in both pictures.
+    assert 7 * 2800 < bright[True] - bright[False] < 7 * 4500
 
 
 def test_giving_up_while_the_camera_starts_stops_it() -> None:
