@@ -185,53 +185,54 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
 def _take_shapes(
     i: int, observed: Observed, model: Model, R: FloatArray, t: FloatArray, more: FloatArray, room: _Room
 ) -> None:
-    for k in range(observed.seen.shape[1]):
-        if observed.seen[i, k]:
-            _place(i, k, observed, model, R, t, more, room)
-            led_shape(
-                room.centre,
-                room.axis,
-                model.radii[k],
-                model.collar,
-                observed.hits,
-                i,
-                k,
-                model.plane_a,
-                model.apart,
-                room.shapes,
-            )
+    # Fields of tuples are taken out once: each time they are touched or passed on is an atomic count.
+    hits, seen, rvec, shift, dt = observed.hits, observed.seen, observed.rvec, observed.shift, observed.dt
+    P, N, radii, shapes = model.P, model.N, model.radii, room.shapes
+    E, R_led, centre, axis = room.E, room.R_led, room.centre, room.axis
+    for k in range(seen.shape[1]):
+        if seen[i, k]:
+            _place(i, k, observed.has_motion, P, N, R, t, more, rvec, shift, dt, E, R_led, centre, axis)
+            led_shape(centre, axis, radii[k], model.collar, hits, i, k, model.plane_a, model.apart, shapes)
 
 
 @compiled
 def _place(
     i: int,
     k: int,
-    observed: Observed,
-    model: Model,
+    has_motion: bool,
+    P: FloatArray,
+    N: FloatArray,
     R: FloatArray,
     t: FloatArray,
     more: FloatArray,
-    room: _Room,
+    rvec: FloatArray,
+    shift: FloatArray,
+    dt: FloatArray,
+    E: FloatArray,
+    R_led: FloatArray,
+    centre: FloatArray,
+    axis: FloatArray,
 ) -> None:
-    """Put an LED's centre and axis, camera frame, at its own instant, into the room, with R_led and E."""
-    if observed.has_motion:
-        dt = observed.dt[i, k]
+    """Find an LED's centre and axis, camera frame, at its own instant, with R_led = R E."""
+    if has_motion:
         rotation(
-            observed.rvec[i, k, 0] + more[1] * dt,
-            observed.rvec[i, k, 1] + more[2] * dt,
-            observed.rvec[i, k, 2] + more[3] * dt,
-            room.E,
+            rvec[i, k, 0] + more[1] * dt[i, k],
+            rvec[i, k, 1] + more[2] * dt[i, k],
+            rvec[i, k, 2] + more[3] * dt[i, k],
+            E,
         )
         for r in range(3):
             for c in range(3):
-                room.R_led[r, c] = R[r, 0] * room.E[0, c] + R[r, 1] * room.E[1, c] + R[r, 2] * room.E[2, c]
-    Rl = room.R_led if observed.has_motion else R
-    P, N = model.P, model.N
+                R_led[r, c] = R[r, 0] * E[0, c] + R[r, 1] * E[1, c] + R[r, 2] * E[2, c]
+    else:
+        for r in range(3):
+            for c in range(3):
+                R_led[r, c] = R[r, c]
     for r in range(3):
-        room.centre[r] = Rl[r, 0] * P[k, 0] + Rl[r, 1] * P[k, 1] + Rl[r, 2] * P[k, 2] + t[r]
-        room.axis[r] = Rl[r, 0] * N[k, 0] + Rl[r, 1] * N[k, 1] + Rl[r, 2] * N[k, 2]
-        if observed.has_motion:
-            room.centre[r] += observed.shift[i, k, r] + more[4 + r] * observed.dt[i, k]
+        centre[r] = R_led[r, 0] * P[k, 0] + R_led[r, 1] * P[k, 1] + R_led[r, 2] * P[k, 2] + t[r]
+        axis[r] = R_led[r, 0] * N[k, 0] + R_led[r, 1] * N[k, 1] + R_led[r, 2] * N[k, 2]
+        if has_motion:
+            centre[r] += shift[i, k, r] + more[4 + r] * dt[i, k]
 
 
 @compiled
@@ -248,43 +249,52 @@ def _normal_equations(
     g: FloatArray,
 ) -> float:
     """Fill in the normal matrix (lower half) and right side, and the frame's residuals; return the cost."""
-    n_leds = observed.seen.shape[1]
+    hits, W, seen, rvec, shift, dt = (
+        observed.hits,
+        observed.W,
+        observed.seen,
+        observed.rvec,
+        observed.shift,
+        observed.dt,
+    )
+    has_motion, has_twist = observed.has_motion, observed.has_twist
+    P, N, radii, plane_a, apart, huber = (
+        model.P,
+        model.N,
+        model.radii,
+        model.plane_a,
+        model.apart,
+        model.huber,
+    )
+    E, R_led, centre, axis, shapes = room.E, room.R_led, room.centre, room.axis, room.shapes
+    J, J_centre, J_axis = room.J, room.J_centre, room.J_axis
+    residual, sigmas_out, area, facing_out = fitted.residual, fitted.sigmas, fitted.area, fitted.facing
     has_profile = model.profile_sd > 0
-    n = _TWIST + 6 if observed.has_twist else _PROFILE + 1 if has_profile else _PROFILE
-    J = room.J
+    n = _TWIST + 6 if has_twist else _PROFILE + 1 if has_profile else _PROFILE
     for c in range(n):
         g[c] = 0.0
         J[0, c], J[1, c] = 0.0, 0.0
         for b in range(c + 1):
             A[c, b] = 0.0
     cost = 0.0
-    for k in range(n_leds):
-        if not observed.seen[i, k]:
+    for k in range(seen.shape[1]):
+        if not seen[i, k]:
             continue
-        _place(i, k, observed, model, R, t, more, room)
-        if not room.centre[2] > 0:
+        _place(i, k, has_motion, P, N, R, t, more, rvec, shift, dt, E, R_led, centre, axis)
+        if not centre[2] > 0:
             return np.inf
         du, dv, facing, magnification, shown_u, shown_v = led_view(
-            room.centre,
-            room.axis,
-            observed.hits,
-            i,
-            k,
-            model.plane_a,
-            model.apart,
-            room.shapes,
-            room.J_centre,
-            room.J_axis,
+            centre, axis, hits, i, k, plane_a, apart, shapes, J_centre, J_axis
         )
-        fitted.facing[i, k], fitted.area[i, k] = facing, room.shapes[k, AREA] * magnification
-        per_profile = model.shift_per_radius * model.radii[k]
+        facing_out[i, k], area[i, k] = facing, shapes[k, AREA] * magnification
+        per_profile = model.shift_per_radius * radii[k]
         r0 = -du - per_profile * shown_u * more[0]
         r1 = -dv - per_profile * shown_v * more[0]
         for row in range(2):
-            _pose_row(row, i, k, R, observed, model, room)
+            _pose_row(row, k, has_motion, has_twist, dt[i, k], P, N, R_led, E, J_centre, J_axis, J)
         if has_profile:
             J[0, _PROFILE], J[1, _PROFILE] = per_profile * shown_u, per_profile * shown_v
-        w00, w01, w11 = observed.W[i, k, 0, 0], observed.W[i, k, 0, 1], observed.W[i, k, 1, 1]
+        w00, w01, w11 = W[i, k, 0, 0], W[i, k, 0, 1], W[i, k, 1, 1]
         if has_profile:  # this LED's own part of what the profile leaves unknown: inverse of cov + m m'
             own = per_profile * model.own_sd
             m0, m1 = own * shown_u, own * shown_v
@@ -292,12 +302,12 @@ def _normal_equations(
             gain = 1 / (1 + m0 * p0 + m1 * p1)
             w00, w01, w11 = w00 - gain * p0 * p0, w01 - gain * p0 * p1, w11 - gain * p1 * p1
         sigmas = math.sqrt(max(w00 * r0 * r0 + 2 * w01 * r0 * r1 + w11 * r1 * r1, 0.0))
-        fitted.residual[i, k, 0], fitted.residual[i, k, 1], fitted.sigmas[i, k] = r0, r1, sigmas
-        if sigmas <= model.huber:
+        residual[i, k, 0], residual[i, k, 1], sigmas_out[i, k] = r0, r1, sigmas
+        if sigmas <= huber:
             cost += sigmas * sigmas
         else:
-            cost += model.huber * (2 * sigmas - model.huber)
-            weight = model.huber / sigmas
+            cost += huber * (2 * sigmas - huber)
+            weight = huber / sigmas
             w00, w01, w11 = w00 * weight, w01 * weight, w11 * weight
         for c in range(n):
             j0, j1 = w00 * J[0, c] + w01 * J[1, c], w01 * J[0, c] + w11 * J[1, c]
@@ -321,12 +331,23 @@ def _normal_equations(
 
 
 @compiled
-def _pose_row(row: int, i: int, k: int, R: FloatArray, observed: Observed, model: Model, room: _Room) -> None:
+def _pose_row(
+    row: int,
+    k: int,
+    has_motion: bool,
+    has_twist: bool,
+    dt: float,
+    P: FloatArray,
+    N: FloatArray,
+    Rl: FloatArray,
+    E: FloatArray,
+    J_centre: FloatArray,
+    J_axis: FloatArray,
+    J: FloatArray,
+) -> None:
     """Fill in one row of J: by the turn and shift of the brick, and by the twist."""
-    J, P, N = room.J, model.P, model.N
-    Rl = room.R_led if observed.has_motion else R
-    c0, c1, c2 = room.J_centre[row, 0], room.J_centre[row, 1], room.J_centre[row, 2]
-    a0, a1, a2 = room.J_axis[row, 0], room.J_axis[row, 1], room.J_axis[row, 2]
+    c0, c1, c2 = J_centre[row, 0], J_centre[row, 1], J_centre[row, 2]
+    a0, a1, a2 = J_axis[row, 0], J_axis[row, 1], J_axis[row, 2]
     # In brick axes; a turn theta moves the centre by R (theta x P): its row is P x (R' J).
     x, y, z = (
         Rl[0, 0] * c0 + Rl[1, 0] * c1 + Rl[2, 0] * c2,
@@ -342,12 +363,10 @@ def _pose_row(row: int, i: int, k: int, R: FloatArray, observed: Observed, model
     t1 = P[k, 2] * x - P[k, 0] * z + N[k, 2] * p - N[k, 0] * s
     t2 = P[k, 0] * y - P[k, 1] * x + N[k, 0] * q - N[k, 1] * p
     J[row, 3], J[row, 4], J[row, 5] = c0, c1, c2
-    if observed.has_twist:
-        dt = observed.dt[i, k]
+    if has_twist:
         J[row, 7], J[row, 8], J[row, 9] = t0 * dt, t1 * dt, t2 * dt
         J[row, 10], J[row, 11], J[row, 12] = c0 * dt, c1 * dt, c2 * dt
-    if observed.has_motion:  # R_led = R E: a turn theta of the frame's brick is E' theta of the LED's
-        E = room.E
+    if has_motion:  # R_led = R E: a turn theta of the frame's brick is E' theta of the LED's
         J[row, 0] = E[0, 0] * t0 + E[0, 1] * t1 + E[0, 2] * t2
         J[row, 1] = E[1, 0] * t0 + E[1, 1] * t1 + E[1, 2] * t2
         J[row, 2] = E[2, 0] * t0 + E[2, 1] * t1 + E[2, 2] * t2
