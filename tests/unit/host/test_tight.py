@@ -1,0 +1,149 @@
+"""Tightly coupled fusion against simulated runs of a unit: chip registers, LED centroids, exact truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from daemon_runs import simulate_run
+from scipy.spatial.transform import Rotation
+
+from bricktrack_host.fusion.led_measurements import SeenLeds
+from bricktrack_host.fusion.smoother import ATT, N_STATES, POS, VEL
+from bricktrack_host.fusion.smoother_kernel import LedArrays, observe_led
+from bricktrack_host.fusion.tight import fuse_tight
+from bricktrack_host.tracking.optical_track import solve_poses
+
+LEDS = ("m0", "m1", "m2", "m3", "m4", "m5", "m6")
+
+
+def fused(run, *, optical=None):
+    optical = optical or solve_poses(run.observations, run.camera, run.brick)
+    t_ns = np.arange(optical.t_ns[5], optical.t_ns[-5], 5_000_000)
+    return fuse_tight(
+        run.observations, optical, run.imu, run.camera, run.brick,
+        lever_arm_mm=run.lever_arm_mm, output_t_ns=t_ns,
+    )  # fmt: skip
+
+
+def squared_mm(run, track):
+    _, t_mm = run.truth(track.t_ns)
+    return ((track.t_camera_brick_mm - t_mm) ** 2).sum(axis=1)
+
+
+def rms(*squares):
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def normalised(run, track):
+    R, t_mm = run.truth(track.t_ns)
+    turn = Rotation.from_matrix(np.swapaxes(track.R_camera_brick, 1, 2) @ R).as_rotvec()
+    e = np.concatenate([turn, t_mm - track.t_camera_brick_mm], axis=1)
+    return (e * np.linalg.solve(track.covariance, e[..., None])[..., 0]).sum(axis=1)
+
+
+@pytest.mark.slow
+def test_error_is_at_most_half_of_the_pose_level_ones_at_full_speed():
+    tight, poses, covered, speeds = [], [], [], []
+    for seed in (13, 15):
+        run = simulate_run(
+            seed, duration_s=8.0, amplitude_mm=8.0, amplitude_deg=3.0, impact_mps=0.25,
+            dropouts=((3.0, 0.5), (6.0, 0.5)), stamp_offset_ns=3_300_000,
+        )  # fmt: skip
+        result = fused(run)
+        tight.append(squared_mm(run, result.fused.track))
+        poses.append(squared_mm(run, result.pose_level.track))
+        covered.append((normalised(run, result.fused.track) < 12.59).mean())
+        speeds.append(np.linalg.norm(run.world.twist(result.fused.track.t_ns)[1], axis=1).max())
+    assert min(speeds) > 300
+    assert rms(*tight) < 0.5 * rms(*poses)
+    assert np.mean(covered) > 0.93
+
+
+def test_one_or_two_leds_hold_the_motion_where_no_pose_can_be_had():
+    hidden = tuple((name, 2.5, 1.5) for name in LEDS if name not in ("m1", "m5"))
+    run = simulate_run(21, duration_s=6.0, hidden_leds=hidden, amplitude_mm=5.0)
+    result = fused(run)
+    t_ns = result.fused.track.t_ns
+    since = run.world.since_first_edge_s(t_ns)
+    inside = (since > 2.55) & (since < 3.95)
+    tight, poses = (squared_mm(run, r.track)[inside] for r in (result.fused, result.pose_level))
+    assert rms(tight) < 0.15
+    assert rms(tight) < 0.1 * rms(poses)
+
+
+def test_false_centroids_are_left_out_one_by_one():
+    clean = simulate_run(22, duration_s=5.0)
+    run = simulate_run(22, duration_s=5.0, outlier_share=0.02)
+    result = fused(run)
+    assert rms(squared_mm(run, result.fused.track)) < 1.25 * rms(squared_mm(clean, fused(clean).fused.track))
+    far = np.linalg.norm(run.observations.uv_px - clean.observations.uv_px, axis=2) > 1.0
+    assert result.led_rejected[far].mean() > 0.95
+    assert result.led_rejected[~far].mean() < 0.002
+
+
+def test_poses_that_are_wrong_together_are_noticed_by_the_cross_check():
+    run = simulate_run(23, duration_s=5.0)
+    optical = solve_poses(run.observations, run.camera, run.brick)
+    assert fused(run, optical=optical).check.agrees
+    shifted = replace(optical, t_camera_brick_mm=optical.t_camera_brick_mm + [0.4, 0.0, 0.0])
+    check = fused(run, optical=shifted).check
+    assert not check.agrees
+    assert check.rms_mm == pytest.approx(0.4, abs=0.05)
+
+
+def test_understated_centroid_noise_is_noticed():
+    run = simulate_run(24, duration_s=5.0, centroid_sd_px=0.2)
+    told = replace(run.observations, cov_px2=run.observations.cov_px2 / 16)
+    result = fused(replace(run, observations=told))
+    # A part of the stated covariance is the profile's, which is not understated.
+    assert 2.0 < result.centroid_noise_scale < 4.5
+    assert (normalised(run, result.fused.track) < 12.59).mean() > 0.9
+
+
+def test_leds_are_taken_in_the_order_of_their_instants_and_only_if_usable():
+    run = simulate_run(25, duration_s=3.0, dropouts=((1.0, 0.2),))
+    leds = SeenLeds.of(run.observations, run.camera)
+    assert (np.diff(leds.t_ns) >= 0).all()
+    assert len(leds.t_ns) == np.isfinite(run.observations.uv_px).all(axis=2).sum()
+
+
+def test_led_jacobian_is_the_derivative():
+    rng = np.random.default_rng(4)
+    step = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix()
+    leds = LedArrays(
+        first=np.array([[0], [1]]),
+        use=np.array([True]),
+        dt_s=np.array([0.004]),
+        since_mid_s=np.array([3.0]),
+        R_step=step[None],
+        dv_mps=np.array([[0.02, -0.03, 0.01]]),
+        dp_m=np.array([[4e-5, -6e-5, 2e-5]]),
+        omega_radps=np.array([[1.0, -2.0, 0.5]]),
+        R_lin=Rotation.random(rng=rng).as_matrix()[None],
+        t_lin_m=rng.normal(0, 0.05, (1, 3)),
+        residual_px=np.array([[0.1, -0.2]]),
+        J=rng.normal(0, 1e3, (1, 2, 6)),
+        cov_px2=np.eye(2)[None],
+        nis=np.zeros(1),
+        inflation=np.ones(1),
+    )
+    arm = np.array([0.026, 0.053, 0.014])
+    x = np.zeros(N_STATES)
+    x[POS], x[VEL] = leds.t_lin_m[0] + [0.02, 0.05, 0.01], [0.1, -0.3, 0.2]
+    R = leds.R_lin[0] @ step.T
+
+    def seen(d):
+        moved = x + d
+        moved[ATT] = 0
+        H, y = np.zeros((2, N_STATES)), np.zeros(2)
+        turned = R @ Rotation.from_rotvec(d[ATT]).as_matrix()
+        observe_led(leds, 0, turned, moved, arm, np.zeros(3), np.zeros(5), 0.0, 0.0, H, y)
+        return y, H
+
+    y, H = seen(np.zeros(N_STATES))
+    for i in range(N_STATES):
+        d = np.zeros(N_STATES)
+        d[i] = 1e-7
+        numeric = (seen(-d)[0] - seen(d)[0]) / 2e-7  # the residual is seen less predicted
+        # What the bias of the gyro does to the small way from node to LED is taken to first order in it.
+        assert np.allclose(numeric, H[:, i], rtol=2e-3, atol=2e-5 * np.abs(H).max()), i
