@@ -24,9 +24,9 @@ from bricktrack_common.wire_messages import (
     encode_message,
 )
 from bricktrack_host.transfer import part_folder
+from bricktrack_host.transfer.contact import Dialer
 from bricktrack_host.transfer.fleet_config import UnitConfig, unit_at
 from bricktrack_host.transfer.part_folder import JOURNAL_NAME
-from bricktrack_host.transfer.contact import Dialer
 from bricktrack_host.transfer.pull import pull_fleet, pull_unit
 from bricktrack_host.transfer.run_transfer import pull_run
 from bricktrack_host.transfer.unit_client import UnitClient
