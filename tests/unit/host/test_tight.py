@@ -85,7 +85,7 @@ def test_poses_that_are_wrong_together_are_noticed_by_the_cross_check():
     run = simulate_run(23, duration_s=5.0)
     optical = solve_poses(run.observations, run.camera, run.brick)
     assert fused(run, optical=optical).check.agrees
-    shifted = replace(optical, t_camera_brick_mm=optical.t_camera_brick_mm + [0.4, 0.0, 0.0])
+    shifted = replace(optical, t_camera_brick_mm=optical.t_camera_brick_mm + np.array([0.4, 0, 0]))
     check = fused(run, optical=shifted).check
     assert not check.agrees
     assert check.rms_mm == pytest.approx(0.4, abs=0.05)
@@ -140,7 +140,7 @@ def test_led_jacobian_is_the_derivative():
         observe_led(leds, 0, turned, moved, arm, np.zeros(3), np.zeros(5), 0.0, 0.0, H, y)
         return y, H
 
-    y, H = seen(np.zeros(N_STATES))
+    _, H = seen(np.zeros(N_STATES))
     for i in range(N_STATES):
         d = np.zeros(N_STATES)
         d[i] = 1e-7
