@@ -3,6 +3,7 @@
 `docs/results-format.md` describes the files.
 """
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,8 +24,15 @@ from bricktrack_host.assemblies.component_motion import (
     assembly_motion,
 )
 from bricktrack_host.durable_files import write_folder_whole
+from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.edge_comparison import EdgeComparison, compare_edges
-from bricktrack_host.results.result_store import Provenance, RunResult, read_result, software_version
+from bricktrack_host.results.result_store import (
+    Details,
+    Provenance,
+    RunResult,
+    read_result,
+    software_version,
+)
 from bricktrack_host.results.result_tables import (
     Column,
     Columns,
@@ -33,6 +41,7 @@ from bricktrack_host.results.result_tables import (
     make_table,
     vector_columns,
 )
+from bricktrack_host.results.run_summary import key_figures, verdict
 from bricktrack_host.transfer.assembly_config import AssemblyConfig
 
 TEST_SCHEMA = "bricktrack.test"
@@ -58,6 +67,14 @@ class UnitEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         Added to its edge numbers.
     edges : str
         ``agrees``, ``corrected``, ``contradictory``, ``unknown``, or ``none`` without edges.
+    problems : list of str
+        As the report of its run says them.
+    witnesses : list of dict
+        What each witness says is to be added, ``samples``, and its deviation, ``sd_samples``.
+    figures : dict
+        How good the run is, in numbers.
+    results : str or None
+        Folder of the run's results, seen from the test's; absolute on another drive.
     """
 
     unit: str
@@ -67,6 +84,9 @@ class UnitEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     edges: str
     problems: list[str]
     provenance: Provenance
+    witnesses: list[dict[str, str | float]] = []
+    figures: Details = {}
+    results: str | None = None
 
 
 class AssemblyEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -116,6 +136,7 @@ def combine_test(
     folder: Path,
     *,
     progress: Callable[[str, int, int], None] | None = None,
+    also: Callable[[Path], object] | None = None,
 ) -> TestSummary:
     """Compare the units of one shake, solve its assemblies, and write both to a folder, whole or not at all.
 
@@ -132,6 +153,8 @@ def combine_test(
     folder : Path
     progress : callable, optional
         Called with what is being done, how many are done, and of how many.
+    also : callable, optional
+        Writes more files into the finished folder that it is given, before that takes its name.
 
     Raises
     ------
@@ -142,9 +165,12 @@ def combine_test(
     """
     say = progress or (lambda _what, _done, _of: None)
     units: dict[str, RunResult] = {}
+    quality: dict[str, tuple[list[str], Details]] = {}
     for i, (unit, path) in enumerate(results.items()):
         say("comparing edges", i, len(results))
-        units[unit] = replace(read_result(path), fused={})
+        result = read_result(path)
+        quality[unit] = _quality(result)
+        units[unit] = replace(result, fused={})
     if len({result.manifest.simulated for result in units.values()}) > 1:
         raise RunFormatError(f"test {name!r}: some runs are simulated and some are not. Combine them apart")
     comparison = compare_edges(units)
@@ -167,8 +193,12 @@ def combine_test(
                     pa.csv.WriteOptions(quoting_style="needed"),
                 )
             entries.append(_assembly_entry(solved, table_name))
-        summary = _summary(name, units, comparison, entries)
+        places = {unit: _seen_from(folder, path) for unit, path in results.items()}
+        summary = _summary(name, units, comparison, entries, quality, places)
         (partial / TEST_SUMMARY_NAME).write_bytes(dump_json(summary))
+        if also is not None:
+            say("writing the report", 0, 1)
+            also(partial)
 
     write_folder_whole(folder, write, marker=TEST_SUMMARY_NAME)
     return read_test(folder)
@@ -267,9 +297,10 @@ def _assembly_entry(solved: _Solved, table: str | None) -> AssemblyEntry:
     peak_deg: dict[str, float] = {}
     for one in () if motion is None else motion.components:
         moved = one.motion.about(points[one.component])
-        if np.isfinite(moved.t_mm).any():
-            peak_mm[one.component] = float(np.nanmax(np.linalg.norm(moved.t_mm, axis=1)))
-            turn = np.linalg.norm(rvec_from_matrix(moved.R), axis=1)
+        known = np.isfinite(moved.t_mm).all(axis=1) & (moved.flags & int(PoseFlag.EXTRAPOLATED) == 0)
+        if known.any():
+            peak_mm[one.component] = float(np.nanmax(np.linalg.norm(moved.t_mm[known], axis=1)))
+            turn = np.linalg.norm(rvec_from_matrix(moved.R[known]), axis=1)
             peak_deg[one.component] = float(np.rad2deg(np.nanmax(turn)))
     return AssemblyEntry(
         name=config.name,
@@ -301,6 +332,8 @@ def _summary(
     units: Mapping[str, RunResult],
     comparison: EdgeComparison | None,
     assemblies: list[AssemblyEntry],
+    quality: Mapping[str, tuple[list[str], Details]],
+    places: Mapping[str, str],
 ) -> TestSummary:
     slips = {} if comparison is None else {slip.unit: slip for slip in comparison.units}
     entries = []
@@ -314,8 +347,14 @@ def _summary(
                 simulated=result.manifest.simulated,
                 slip_samples=0 if slip is None else slip.samples,
                 edges=edges,
-                problems=list(result.problems),
+                problems=quality[unit][0],
                 provenance=result.provenance,
+                witnesses=[
+                    {"witness": t.witness, "samples": t.samples, "sd_samples": t.sd_samples}
+                    for t in (slip.testimonies if slip else ())
+                ],
+                figures=quality[unit][1],
+                results=places[unit],
             )
         )
     problems = [] if comparison is None else comparison.problems()
@@ -331,6 +370,34 @@ def _summary(
         conventions=CONVENTIONS,
         software_version=software_version(),
     )
+
+
+def _quality(result: RunResult) -> tuple[list[str], Details]:
+    """Return what is wrong with a run in words, and how good it is in numbers; `None` where not known."""
+    f = key_figures(result)
+    numbers: Details = {
+        "frames": f.n_frames,
+        "frames_dropped": f.n_frames_dropped,
+        "poses": f.n_poses,
+        "dropouts": len(f.dropouts_ns),
+        "longest_dropout_s": float(np.diff(f.dropouts_ns).max()) / 1e9 if len(f.dropouts_ns) else 0.0,
+        "impacts": len(f.impacts_ns),
+        "residual_rms_px": f.residual_rms_px,
+        "sd_mm": float(np.sqrt(np.sum(f.sd_mm**2))),
+        "sd_deg": float(np.sqrt(np.sum(f.sd_deg**2))),
+    }
+    known: Details = {
+        name: None if isinstance(value, float) and np.isnan(value) else value
+        for name, value in numbers.items()
+    }
+    return verdict(result, f)[1], known
+
+
+def _seen_from(folder: Path, results: Path) -> str:
+    try:
+        return Path(os.path.relpath(results.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return results.resolve().as_posix()
 
 
 def _nominal_hz(units: Mapping[str, RunResult]) -> float | None:

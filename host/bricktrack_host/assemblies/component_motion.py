@@ -13,7 +13,7 @@ from bricktrack_host.assemblies.motion import Motion, disagreement
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.tracks import FusedTrack
+from bricktrack_host.tracks import FusedTrack, OpticalTrack
 from bricktrack_host.transfer.assembly_config import AssemblyConfig, View
 
 
@@ -192,6 +192,16 @@ def _usable(
     return result.edge_index, result.fused["edge"], result.rest
 
 
+def motion_from_rest(track: FusedTrack | OpticalTrack, rest: RestPose) -> Motion:
+    """Return how the LEDs' component moved from rest, in the layout's axes at rest.
+
+    The covariance holds that of the rest pose too.
+    """
+    relative = rest.relative(track.R_camera_brick, track.t_camera_brick_mm)
+    covariance = _relative_covariance(relative, track.covariance, rest)
+    return Motion(relative.R, relative.t_mm, covariance, track.flags)
+
+
 def _motion_of(view: View, sample: IntArray, index: IntArray, track: FusedTrack, rest: RestPose) -> Motion:
     """Return what one view saw, in brick axes; NaN at samples that it did not see."""
     n = len(sample)
@@ -199,9 +209,8 @@ def _motion_of(view: View, sample: IntArray, index: IntArray, track: FusedTrack,
     covariance = np.full((n, 6, 6), np.nan)
     flags = np.full(n, int(PoseFlag.NO_POSE), dtype=np.int64)
     rows = index - sample[0]
-    relative = rest.relative(track.R_camera_brick, track.t_camera_brick_mm)
-    R[rows], t_mm[rows], flags[rows] = relative.R, relative.t_mm, track.flags
-    covariance[rows] = _relative_covariance(relative, track.covariance, rest)
+    seen = motion_from_rest(track, rest)
+    R[rows], t_mm[rows], covariance[rows], flags[rows] = seen.R, seen.t_mm, seen.covariance, seen.flags
     return Motion(R, t_mm, covariance, flags).in_axes(view.pose_brick_layout)
 
 

@@ -42,6 +42,7 @@ def combine(
     """
     from bricktrack_host.assemblies.combined_test import combine_test
     from bricktrack_host.pipeline import RESULTS_FOLDER
+    from bricktrack_host.reporting.combined_report import REPORT_NAME, write_combined_report
 
     path = fleet_path(fleet)
     config = load_fleet(path)
@@ -58,7 +59,7 @@ def combine(
     with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task("")
         summary = combine_test(
-            name, results, config.assembly, folder,
+            name, results, config.assembly, folder, also=write_combined_report,
             progress=lambda what, done, of: bar.update(task, description=what, completed=done, total=of),
         )  # fmt: skip
     if as_json:
@@ -66,6 +67,7 @@ def combine(
         return
     say_test(summary)
     out.print(f"results: {folder}", markup=False, soft_wrap=True)
+    out.print(f"report:  {folder / REPORT_NAME}", markup=False, soft_wrap=True)
 
 
 def say_test(summary: "TestSummary") -> None:

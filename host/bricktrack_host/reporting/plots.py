@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import welch
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
@@ -17,6 +16,7 @@ from bricktrack_host.reporting.chart_marks import Dots, Instants, Line, Spans, b
 from bricktrack_host.reporting.thinning import thinned, thinned_band
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.run_summary import KeyFigures, main_track
+from bricktrack_host.results.spectra import MIN_SAMPLES, amplitude_spectrum
 
 FUSED = "#1f5f8b"
 OPTICAL = "#c8651b"
@@ -147,7 +147,7 @@ def motion_chart(
     track = main_track(result)
     optical = result.optical
     optical_s = axis.s(optical.t_ns)
-    optical_y, optical_sd = _six(
+    optical_y, optical_sd = six_components(
         result, optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance
     )
     chosen = np.ones(len(optical_s), dtype=bool)
@@ -158,7 +158,9 @@ def motion_chart(
         inside = track.flags & int(PoseFlag.EXTRAPOLATED) == 0
         if span_s is not None:
             inside &= (fused_s >= span_s[0]) & (fused_s <= span_s[1])
-        fused_y, fused_sd = _six(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
+        fused_y, fused_sd = six_components(
+            result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance
+        )
         fused_s, fused_y, fused_sd = fused_s[inside], fused_y[inside], fused_sd[inside]
     d = "d" if result.rest is not None else ""
     names = [f"{d}x, mm", f"{d}y, mm", f"{d}z, mm", f"{d}rot x, deg", f"{d}rot y, deg", f"{d}rot z, deg"]
@@ -191,30 +193,33 @@ def spectrum_chart(result: RunResult) -> Chart | None:
         return None
     inside = track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) == 0
     inside &= np.isfinite(track.t_camera_brick_mm).all(axis=1)
-    if np.count_nonzero(inside) < 64:
+    if np.count_nonzero(inside) < MIN_SAMPLES:
         return None
-    t_s = (track.t_ns[inside] - track.t_ns[inside][0]) / 1e9
-    step_s = float(np.median(np.diff(t_s)))
-    even_s = np.arange(0, t_s[-1], step_s)
-    values, _ = _six(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
-    camera = result.manifest.camera
-    nyquist_hz = 0.5e6 / camera.frame_duration_us if camera and camera.frame_duration_us > 0 else None
+    values, _ = six_components(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
+    spectrum = amplitude_spectrum((track.t_ns[inside] - track.t_ns[inside][0]) / 1e9, values[inside])
+    nyquist_hz = half_frame_rate_hz(result)
     chart = panel_grid(1, 2, height_in=2.9, titles=True, share_x="none")
     (panels,) = chart.panels
     for panel, title, unit in zip(panels, ("Displacement", "Rotation"), ("mm", "deg"), strict=True):
         panel.title, panel.y_label, panel.x_label = title, f"{unit} / sqrt(Hz)", "frequency, Hz"
-        panel.x_limits, panel.log_y, panel.legend = (0.0, 0.5 / step_s), True, True
+        panel.x_limits, panel.log_y, panel.legend = (0.0, float(spectrum.f_hz[-1])), True, True
     for i in range(6):
-        y = np.interp(even_s, t_s, values[inside, i])
-        f_hz, power = welch(y, 1 / step_s, nperseg=min(len(y), 512), detrend="constant")
-        panels[i // 3].add(Line(f_hz[1:], np.sqrt(power[1:]), LED_COLOURS[i % 3], label="xyz"[i % 3]))
+        panels[i // 3].add(
+            Line(spectrum.f_hz, spectrum.density[:, i], LED_COLOURS[i % 3], label="xyz"[i % 3])
+        )
     if nyquist_hz is not None:
         for panel in panels:
             panel.add(Instants(np.array([nyquist_hz]), INK, 0.7, dashes_pt=(0.8, 1.4)))
     return chart
 
 
-def _six(
+def half_frame_rate_hz(result: RunResult) -> float | None:
+    """Return the frequency up to which frames alone can tell motion, by the configured frame rate."""
+    camera = result.manifest.camera
+    return 0.5e6 / camera.frame_duration_us if camera and camera.frame_duration_us > 0 else None
+
+
+def six_components(
     result: RunResult, R: FloatArray, t_mm: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return x, y, z, mm, and rotation vector, deg, from rest if there is one, with their deviations."""

@@ -4,7 +4,6 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.imu_records import UNUSABLE
-from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.reporting.chart import Chart, panel_grid, picture_chart
 from bricktrack_host.reporting.chart_marks import Area, Arrows, Dots, Signs, Words, band
 from bricktrack_host.reporting.plots import (
@@ -19,6 +18,7 @@ from bricktrack_host.reporting.plots import (
     line,
     mark_events,
 )
+from bricktrack_host.reporting.rate_comparison import compare_rates, imu_minus_camera_ns
 from bricktrack_host.reporting.thinning import thinned_band
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.run_summary import KeyFigures
@@ -78,9 +78,7 @@ def timing_chart(result: RunResult, figures: KeyFigures) -> Chart:
     stamps = result.observations.sensor_timestamp_ns
     frames.title = "Frames: time between stamps, less whole frame periods"
     if len(stamps) > 2:
-        steps_ns = np.diff(stamps)
-        periods = np.rint(steps_ns / figures.frame_period_ns)
-        off_us = (steps_ns - periods * figures.frame_period_ns) / 1000
+        off_us, periods = frame_intervals_us(result, figures)
         at_s, whole, gap = axis.s(stamps[1:]), periods == 1, periods > 1
         frames.add(Dots(at_s[whole], off_us[whole], OPTICAL, 1.8))
         if gap.any():
@@ -115,6 +113,13 @@ def timing_chart(result: RunResult, figures: KeyFigures) -> Chart:
     return chart
 
 
+def frame_intervals_us(result: RunResult, figures: KeyFigures) -> tuple[FloatArray, FloatArray]:
+    """Return the times between frame stamps less whole frame periods, us, and how many periods each is."""
+    steps_ns = np.diff(result.observations.sensor_timestamp_ns)
+    periods = np.rint(steps_ns / figures.frame_period_ns)
+    return np.asarray((steps_ns - periods * figures.frame_period_ns) / 1000), np.asarray(periods)
+
+
 def imu_lateness_us(result: RunResult) -> FloatArray | None:
     """Return how long after its slot each inertial sample was taken, us; NaN in gaps."""
     if result.imu is None or not result.manifest.imus or not len(result.imu.t_ns):
@@ -128,49 +133,48 @@ def imu_lateness_us(result: RunResult) -> FloatArray | None:
     return np.asarray(np.where(usable, after_ns / 1000.0, np.nan))
 
 
-def alignment_chart(result: RunResult, *, imu_minus_camera_ns: int = 0) -> Chart | None:
-    """Return the angular rates of gyroscope and optics where they are fastest; `None` without both.
-
-    The optical rate is the turn from one frame to the next over the time between; the gyroscope is averaged
-    over the same time, so that what is left is misalignment.
-    """
-    imu, optical = result.imu, result.optical
-    if imu is None:
+def alignment_chart(result: RunResult) -> Chart | None:
+    """Return the angular rates of gyroscope and optics where they are fastest; `None` without both."""
+    rates = compare_rates(result)
+    if rates is None or not np.isfinite(rates.optical_dps).any():
         return None
-    usable = np.isfinite(imu.gyro_radps).all(axis=1)
-    good = np.isfinite(optical.R_camera_brick).all(axis=(1, 2))
-    if np.count_nonzero(usable) < 10 or np.count_nonzero(good) < 10:
-        return None
-    axis = TimeAxis.of(result)
-    t_ns, R = optical.t_ns[good], optical.R_camera_brick[good]
-    step_s = np.diff(t_ns) / 1e9
-    turn = rvec_from_matrix(np.swapaxes(R[:-1], -1, -2) @ R[1:])
-    close = step_s < 2.5 * np.median(step_s)
-    optical_dps = np.rad2deg(turn / step_s[:, None])
-    optical_dps[~close] = np.nan
-    middle_s = axis.s(t_ns[:-1] + np.diff(t_ns) // 2)
-    gyro_s = axis.s(imu.t_ns[usable] - imu_minus_camera_ns)
-    gyro_dps = np.rad2deg(imu.gyro_radps[usable])
-    bounds = np.stack([axis.s(t_ns[:-1]), axis.s(t_ns[1:])], axis=1)
-    mean_dps = _means_over(gyro_s, gyro_dps, bounds)
-    offset = np.nanmedian(mean_dps - optical_dps, axis=0) if np.isfinite(optical_dps).any() else np.zeros(3)
-    fastest = middle_s[np.nanargmax(np.nansum(optical_dps**2, axis=1))]
+    fastest_s = rates.optical_s[np.nanargmax(np.nansum(rates.optical_dps**2, axis=1))]
     chart = panel_grid(2, 3, height_in=3.9, legend=True, titles=True, share_x="row",
                        labelled_columns=False, heights=(1.5, 1.0))  # fmt: skip
-    near = (gyro_s > fastest - 0.5) & (gyro_s < fastest + 0.5)
-    near_frames = (middle_s > fastest - 0.5) & (middle_s < fastest + 0.5)
-    difference = mean_dps - offset - optical_dps
-    limit = _limit(difference, 1.0)
+    near = np.abs(rates.gyro_s - fastest_s) < 0.5
+    near_frames = np.abs(rates.optical_s - fastest_s) < 0.5
+    limit = _limit(rates.difference_dps, 1.0)
     for i, (top, low) in enumerate(zip(*chart.panels, strict=True)):
         top.title = f"about brick {'xyz'[i]}"
         top.add(
-            line(gyro_s[near], gyro_dps[near, i] - offset[i], colour=FUSED, label="gyroscope less bias"),
-            Dots(middle_s[near_frames], optical_dps[near_frames, i], OPTICAL, 3.0,
+            line(rates.gyro_s[near], rates.gyro_dps[near, i], colour=FUSED, label="gyroscope less bias"),
+            Dots(rates.optical_s[near_frames], rates.optical_dps[near_frames, i], OPTICAL, 3.0,
                  label="optical, frame to frame"),
         )  # fmt: skip
-        low.add(Dots(middle_s, difference[:, i], INK, 1.1))
+        low.add(Dots(rates.optical_s, rates.difference_dps[:, i], INK, 1.1))
         low.y_limits, low.x_label = (-limit, limit), "time, s"
     chart.panels[0][0].y_label, chart.panels[1][0].y_label = "rate, deg/s", "difference, deg/s"
+    return chart
+
+
+def inertial_chart(result: RunResult, figures: KeyFigures) -> Chart | None:
+    """Return what the inertial sensor measured over the run, on the camera's time; `None` without it."""
+    imu = result.imu
+    if imu is None or not len(imu.t_ns):
+        return None
+    axis = TimeAxis.of(result)
+    t_s = axis.s(imu.t_ns - imu_minus_camera_ns(result))
+    chart = panel_grid(3, 2, height_in=5.0, legend=True, titles=True)
+    for k, (title, values, unit) in enumerate(
+        (("Specific force", imu.acc_mps2, "m/s2"), ("Angular rate", np.rad2deg(imu.gyro_radps), "deg/s"))
+    ):
+        chart.panels[0][k].title = f"{title}, brick axes"
+        chart.panels[-1][k].x_label = axis.label
+        for i in range(3):
+            panel = chart.panels[i][k]
+            mark_events(panel, axis, result, figures)
+            panel.add(line(t_s, values[:, i], colour=FUSED, width_pt=0.9, label="inertial sensor"))
+            panel.y_label = f"{'xyz'[i]}, {unit}"
     return chart
 
 
@@ -219,17 +223,6 @@ def truth_chart(result: RunResult, figures: KeyFigures, comparison: TruthCompari
         panel.y_limits = (-limit, limit)
     panel.x_label = axis.label
     return chart
-
-
-def _means_over(t_s: FloatArray, values: FloatArray, bounds_s: FloatArray) -> FloatArray:
-    """Return the mean of a piecewise linear signal over intervals, shape (k, columns)."""
-    step = np.diff(t_s)[:, None]
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * step * (values[1:] + values[:-1]), axis=0)])
-    out = np.empty((len(bounds_s), values.shape[1]))
-    for c in range(values.shape[1]):
-        ends = np.interp(bounds_s, t_s, integral[:, c], left=np.nan, right=np.nan)
-        out[:, c] = (ends[:, 1] - ends[:, 0]) / (bounds_s[:, 1] - bounds_s[:, 0])
-    return out
 
 
 def _limit(values: FloatArray, least: float) -> float:

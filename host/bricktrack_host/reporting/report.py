@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from enum import IntFlag
 from pathlib import Path
 
-import jinja2
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_common.errors import StorageError
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.reporting.page import Key, OriginTable, page_environment, write_page
 from bricktrack_host.reporting.report_sections import ReportExtras, in_words, report_sections, value_text
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.run_summary import KeyFigures, key_figures, main_track, verdict
@@ -31,13 +30,7 @@ def write_report(result: RunResult, path: Path, extras: ReportExtras | None = No
     StorageError
         If it cannot be written.
     """
-    html = render_report(result, extras)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(html, encoding="utf-8")
-        partial.replace(path)
-    except OSError as e:
-        raise StorageError(f"{path}: the report cannot be written: {e.strerror or e}") from e
+    write_page(path, render_report(result, extras))
 
 
 def render_report(result: RunResult, extras: ReportExtras | None = None) -> str:
@@ -46,28 +39,25 @@ def render_report(result: RunResult, extras: ReportExtras | None = None) -> str:
     figures = key_figures(result)
     line, problems = verdict(result, figures)
     mood = "bad" if not figures.n_poses else "care" if problems else "good"
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("bricktrack_host.reporting"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     sections = report_sections(result, figures, extras)
-    return environment.get_template("report.html.j2").render(
-        run_id=result.manifest.run_id,
-        unit=result.manifest.unit,
-        label=result.manifest.label,
-        simulated=result.manifest.simulated,
-        date=recording_date(result),
-        provenance=result.provenance,
-        verdict=line,
-        mood=mood,
-        problems=problems,
-        key=_key_figures(result, figures),
-        sections=sections,
-        flag_tables=_flag_tables(result),
-        origin_tables=_origin_tables(result),
+    return (
+        page_environment()
+        .get_template("report.html.j2")
+        .render(
+            run_id=result.manifest.run_id,
+            unit=result.manifest.unit,
+            label=result.manifest.label,
+            simulated=result.manifest.simulated,
+            date=recording_date(result),
+            provenance=result.provenance,
+            verdict=line,
+            mood=mood,
+            problems=problems,
+            key=_key_figures(result, figures),
+            sections=sections,
+            flag_tables=_flag_tables(result),
+            origin_tables=_origin_tables(result),
+        )
     )
 
 
@@ -89,37 +79,30 @@ def recording_date(result: RunResult) -> str:
 # Key figures and tables.
 
 
-@dataclass(frozen=True, slots=True)
-class _Key:
-    name: str
-    value: str
-    note: str = ""
-
-
-def _key_figures(result: RunResult, f: KeyFigures) -> list[_Key]:
+def _key_figures(result: RunResult, f: KeyFigures) -> list[Key]:
     longest_s = float((f.dropouts_ns[:, 1] - f.dropouts_ns[:, 0]).max() / 1e9) if len(f.dropouts_ns) else 0.0
     longest = f"longest {longest_s:.2f} s" if longest_s else ""
     dropped = f"{f.n_frames_dropped} dropped by the camera"
     keys = [
-        _Key("Frames with a pose", f"{f.n_poses} of {f.n_frames}", dropped),
-        _Key("Duration", f"{f.duration_s:.2f} s", "" if result.t0_ns is not None else "no trigger"),
-        _Key("Times without a pose", str(len(f.dropouts_ns)), longest),
-        _Key("LED residual", _number(f.residual_rms_px, 3, "px"), "rms over LEDs used"),
-        _Key("Peak displacement", _triple(f.peak_mm, 2, "mm"), "x, y, z from rest"),
-        _Key("Peak rotation", _triple(f.peak_deg, 2, "deg"), "about x, y, z from rest"),
-        _Key("Peak speed", _number(f.peak_speed_mmps, 0, "mm/s")),
-        _Key("Standard deviation", _triple(f.sd_mm, 3, "mm"), "x, y, z, camera axes; median"),
-        _Key("Standard deviation", _triple(f.sd_deg, 3, "deg"), "about brick axes; median"),
-        _Key("Inertial samples", str(f.n_imu) if f.n_imu else "none",
+        Key("Frames with a pose", f"{f.n_poses} of {f.n_frames}", dropped),
+        Key("Duration", f"{f.duration_s:.2f} s", "" if result.t0_ns is not None else "no trigger"),
+        Key("Times without a pose", str(len(f.dropouts_ns)), longest),
+        Key("LED residual", _number(f.residual_rms_px, 3, "px"), "rms over LEDs used"),
+        Key("Peak displacement", _triple(f.peak_mm, 2, "mm"), "x, y, z from rest"),
+        Key("Peak rotation", _triple(f.peak_deg, 2, "deg"), "about x, y, z from rest"),
+        Key("Peak speed", _number(f.peak_speed_mmps, 0, "mm/s")),
+        Key("Standard deviation", _triple(f.sd_mm, 3, "mm"), "x, y, z, camera axes; median"),
+        Key("Standard deviation", _triple(f.sd_deg, 3, "deg"), "about brick axes; median"),
+        Key("Inertial samples", str(f.n_imu) if f.n_imu else "none",
              f"{f.n_imu_unusable} not usable" if f.n_imu else ""),
-        _Key("Impacts", str(len(f.impacts_ns)) if result.fused else "–"),
+        Key("Impacts", str(len(f.impacts_ns)) if result.fused else "–"),
     ]  # fmt: skip
     fit = result.edge_fit
     if fit is None:
-        keys.append(_Key("Square wave", "none"))
+        keys.append(Key("Square wave", "none"))
     else:
         rate = "" if fit.nominal_hz is None else f"{fit.rate_ppm:+.1f} ppm by the unit's clock"
-        keys.append(_Key("Square wave", f"{1e9 / fit.period_ns:.3f} Hz", rate))
+        keys.append(Key("Square wave", f"{1e9 / fit.period_ns:.3f} Hz", rate))
     return keys
 
 
@@ -176,14 +159,7 @@ def _flag_tables(result: RunResult) -> list[_FlagTable]:
     return tables
 
 
-@dataclass(frozen=True, slots=True)
-class _OriginTable:
-    title: str
-    rows: list[tuple[str, str]]
-    mono: bool
-
-
-def _origin_tables(result: RunResult) -> list[_OriginTable]:
+def _origin_tables(result: RunResult) -> list[OriginTable]:
     p, m = result.provenance, result.manifest
     files = [
         ("software", f"bricktrack {p.software_version}"),
@@ -191,10 +167,10 @@ def _origin_tables(result: RunResult) -> list[_OriginTable]:
         ("calibration, SHA-256", p.calibration_sha256 or "none"),
         ("layout, SHA-256", p.layout_sha256 or "none"),
     ]
-    tables = [_OriginTable("Software and files", files, True)]
+    tables = [OriginTable("Software and files", files, True)]
     settings = [(in_words(k), value_text(v)) for k, v in p.settings.items()]
     if settings:
-        tables.append(_OriginTable("Settings", settings, False))
+        tables.append(OriginTable("Settings", settings, False))
     unit: list[tuple[str, str]] = [("recorded by", m.origin), ("state", m.state)]
     if m.camera is not None:
         c = m.camera
@@ -206,10 +182,10 @@ def _origin_tables(result: RunResult) -> list[_OriginTable]:
         for i in m.imus
     ]  # fmt: skip
     unit += [*m.hardware.items(), *((f"version of {k}", v) for k, v in m.software.items())]
-    tables.append(_OriginTable("Unit", unit, False))
+    tables.append(OriginTable("Unit", unit, False))
     if result.timings_s:
         tables.append(
-            _OriginTable("Time taken", [(name, f"{s:.2f} s") for name, s in result.timings_s.items()], False)
+            OriginTable("Time taken", [(name, f"{s:.2f} s") for name, s in result.timings_s.items()], False)
         )
     return tables
 

@@ -116,6 +116,16 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
             embed_chart(motion_chart(result, figures, span_s=span), "Close-up of the time histories",
                    "Close-up around the highest speed. Bars: 95 % of each optical pose.")
         )  # fmt: skip
+    inertial = quality_plots.inertial_chart(result, figures)
+    if inertial is not None:
+        section.figures.append(
+            embed_chart(
+                inertial,
+                "Specific force and angular rate over time",
+                "What the inertial sensor measured, gravity and bias included. Interrupted where samples are "
+                "missing or rejected.",
+            )
+        )
     spectrum = spectrum_chart(result)
     if spectrum is not None:
         section.figures.append(
@@ -190,9 +200,7 @@ def _timing_words(result: RunResult, figures: KeyFigures) -> list[str]:
 
 
 def _alignment_section(result: RunResult) -> list[Section]:
-    offset_ms = result.alignment.get("imu_minus_camera_ms", result.alignment.get("offset_ms", 0.0))
-    offset_ns = round(float(offset_ms) * 1e6) if isinstance(offset_ms, (int, float)) else 0
-    figure = quality_plots.alignment_chart(result, imu_minus_camera_ns=offset_ns)
+    figure = quality_plots.alignment_chart(result)
     if figure is None and not result.alignment:
         return []
     section = Section("alignment", "Camera and inertial sensor")

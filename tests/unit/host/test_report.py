@@ -92,7 +92,7 @@ def test_report_needs_nothing_from_outside(full):
     assert "url(" not in full
     anchors = {v[1:] for v in collector.fetched if v.startswith("#")}
     assert anchors <= set(re.findall(r' id="([a-z]+)"', full))
-    assert collector.tags.count("img") == 12  # motion 3, truth 1, residuals 2, pictures 3, and one each of 3
+    assert collector.tags.count("img") == 13  # motion 4, truth 1, residuals 2, pictures 3, and one each of 3
     assert len(full) < 8_000_000
 
 
