@@ -12,8 +12,7 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from scipy.stats import f as f_distribution
-from scipy.stats import norm
+from scipy.special import fdtrc, ndtr
 
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
@@ -287,7 +286,7 @@ def _choice(
 def _walk_test(fit: RayFit) -> tuple[float, float]:
     """Return the squared walk in its standard deviations, and its p-value."""
     F = float(fit.parameters[-1] ** 2 / fit.covariance[-1, -1])
-    return F, float(2 * norm.sf(np.sqrt(F)))
+    return F, float(2 * ndtr(-np.sqrt(F)))
 
 
 def centrality_test(planes: Planes, order: int, *, sensor_mode: SensorMode) -> tuple[float, float]:
@@ -315,7 +314,7 @@ def centrality_test(planes: Planes, order: int, *, sensor_mode: SensorMode) -> t
     p_wide, p_central = 4 * n_terms(order), 2 * n_terms(order) + 3
     freedom = 2 * sum(len(dots) for _, dots in planes) - p_wide
     F = max(squares[0] - squares[1], 0.0) / (p_wide - p_central) / (squares[1] / freedom)
-    return F, float(f_distribution.sf(F, p_wide - p_central, freedom))
+    return F, float(fdtrc(p_wide - p_central, freedom, F))
 
 
 def doubted_turns(

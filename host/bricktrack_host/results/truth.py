@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from rich import box
 from rich.table import Table
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import TrackingError
@@ -20,7 +20,7 @@ from bricktrack_host.tracks import FusedTrack, OpticalTrack
 
 IMPACT_MPS2 = 30.0  # about 3 g: above the strongest shaking of the table, below the weakest impact
 NEAR_IMPACT_NS = 50_000_000
-_CHI2_95 = float(chi2.ppf(0.95, 6))
+_CHI2_95 = float(chdtri(6, 0.05))
 
 Source = Literal["optical", "fused"]
 COMPONENTS = ("x", "y", "z", "rot x", "rot y", "rot z")
