@@ -5,6 +5,7 @@ import re
 import shutil
 from pathlib import Path
 
+import av
 import msgspec
 import numpy as np
 import pyarrow.parquet as pq
@@ -19,6 +20,7 @@ from bricktrack_host.pipeline import ProcessSettings, process_run
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.recordings.import_recording import Recording, import_recording
 from bricktrack_host.recordings.loose_files import read_rig
+from bricktrack_host.viewing.overlay_video import write_overlay
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data" / "path-traced"
 LAYOUT = SAMPLE / "layout.toml"
@@ -212,3 +214,28 @@ def test_a_layout_of_another_brick_gives_no_pose_but_words(bench, copy, tmp_path
 def test_an_imu_that_the_run_does_not_have_is_named(bench, copy):
     with pytest.raises(ConfigError, match="no IMU 'other'; it has: brick"):
         process(bench, copy, settings=ProcessSettings(imu="other"))
+
+
+def test_a_film_of_the_run_keeps_its_frames_times(processed, bench, tmp_path):
+    film = tmp_path / "film.mp4"
+    n = write_overlay(
+        bench / "runs" / "sample_motion", processed.folder, film, slow=4.0, scale=0.25, frames=(30, 40)
+    )
+    assert n == 10
+    with av.open(str(film)) as container:
+        frames = list(container.decode(video=0))
+    assert [(f.width, f.height) for f in frames] == [(480, 330)] * 10
+    stamps = processed.result.observations.sensor_timestamp_ns[30:40]
+    expected = (stamps - stamps[0]) / 1e9 * 4.0
+    assert [f.time for f in frames] == pytest.approx(expected.tolist(), abs=1e-4)
+    assert list(tmp_path.iterdir()) == [film]
+
+
+def test_a_film_of_another_runs_results_is_refused(processed, bench, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(bench / "runs" / "sample_motion", other)
+    path = other / MANIFEST_NAME
+    write_manifest(path, msgspec.structs.replace(read_manifest(path), run_id="sample_other"))
+    with pytest.raises(RunFormatError, match="not of this run"):
+        write_overlay(other, processed.folder, tmp_path / "film.mp4")
+    assert not (tmp_path / "film.mp4").exists()

@@ -19,6 +19,7 @@ from bricktrack_host.cli import (
     fleet,
     import_cmd,
     keys,
+    overlay,
     process,
     status,
     still,
@@ -78,6 +79,7 @@ app.command("align")(align.align)
 app.command("evaluate")(evaluate.evaluate)
 app.command("combine")(combine.combine)
 app.command("export")(export.export)
+app.command("overlay")(overlay.overlay)
 app.command("demo")(demo.demo)
 
 

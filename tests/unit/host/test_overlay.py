@@ -1,0 +1,88 @@
+"""The film of a run: marks are where the LEDs are, frames keep their times, and nothing half-written stays."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bricktrack_host.viewing import overlay as drawing
+from bricktrack_host.viewing.overlay import STRIP_ROWS, UNUSED, USED, OverlayArtist
+
+spec = importlib.util.spec_from_file_location(
+    "example_report", Path(__file__).parents[3] / "scripts" / "example_report.py"
+)
+example = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(example)
+
+WIDTH, HEIGHT = 1920, 1080
+BLACK = np.full((HEIGHT, WIDTH), 16, dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return example.example_result()
+
+
+@pytest.fixture(scope="module")
+def artist(result):
+    return OverlayArtist.of(result, WIDTH, HEIGHT)
+
+
+def coloured(picture, colour):
+    """Return (u, v) of the pixels of about a colour, in the picture above the strip."""
+    near = np.abs(picture[:HEIGHT].astype(int) - colour).max(axis=2) < 12
+    rows, columns = np.nonzero(near)
+    return np.stack([columns, rows], axis=1)
+
+
+def test_every_used_led_gets_a_ring_around_its_centroid(result, artist):
+    index = 50
+    picture = artist.draw(index, BLACK)
+    assert picture.shape == (HEIGHT + STRIP_ROWS, WIDTH, 3)
+    ring = coloured(picture, USED)
+    checked = 0
+    for uv, area in zip(result.observations.uv_px[index], result.observations.area_px2[index], strict=True):
+        distance = np.linalg.norm(ring - uv, axis=1)
+        radius = np.sqrt(area / np.pi) + 6
+        if np.min([uv - radius, [WIDTH, HEIGHT] - uv - radius]) < 3:
+            continue  # the picture's border cuts this ring
+        checked += 1
+        around = np.abs(distance - radius) < 2.5
+        # A ring two pixels wide has at least its circumference in pixels; its label touches none of it.
+        assert around.sum() > 0.8 * 2 * np.pi * radius
+        mean = ring[around].mean(axis=0)
+        assert np.abs(mean - uv).max() < 1.5
+    assert checked >= 5
+
+
+def test_an_led_that_is_not_used_has_another_colour(result, artist):
+    covered = np.flatnonzero(
+        np.isnan(result.optical.residual_px[:, 0, 0]) & np.isfinite(result.observations.uv_px[:, 0, 0])
+    )
+    picture = artist.draw(int(covered[0]), BLACK)
+    uv = result.observations.uv_px[covered[0], 0]
+    distance = np.linalg.norm(coloured(picture, UNUSED) - uv, axis=1)
+    assert (distance < 60).sum() > 100
+
+
+def test_a_lost_picture_is_grey_and_says_so(artist):
+    picture = artist.draw(5, None)
+    assert (picture[HEIGHT // 2, WIDTH // 2] == 60).all()
+
+
+def test_the_cursor_moves_with_time_not_with_the_frames_number(result, artist):
+    t_ns = result.optical.t_ns
+    columns = [int(artist._cursor[i]) for i in (0, 120, 121, len(t_ns) - 1)]
+    # Two frames are missing after 120: the cursor steps over three periods there.
+    assert columns[2] - columns[1] == pytest.approx(3 * (columns[1] - columns[0]) / 120, abs=1.5)
+
+
+def test_no_rest_is_said(result, monkeypatch):
+    words = []
+    artist = OverlayArtist.of(replace(result, rest=None), WIDTH, HEIGHT)
+    monkeypatch.setattr(drawing, "_write", lambda picture, text, at, colour: words.append(text))
+    artist.draw(3, BLACK)
+    assert any("from the camera" in text for text in words)
+    assert any("SIMULATED" in text for text in words)
