@@ -9,6 +9,7 @@ from bricktrack_device.health import machine, storage
 from bricktrack_device.health.camera import check_camera
 from bricktrack_device.health.findings import CheckResult, good, tried
 from bricktrack_device.health.inertial import check_adapter, check_imu
+from bricktrack_device.health.keys import check_keys
 from bricktrack_device.health.trigger_line import check_trigger
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.recording import software_versions
@@ -36,6 +37,7 @@ def _checks(config: DeviceConfig, rig: Rig) -> list[tuple[str, str, Check]]:
         ),
         ("storage speed", "Set storage.folder to a folder that this user may write", lambda: _speed(config)),
         ("port", "Stop the program that holds it, or set server.port", lambda: _check_port(config)),
+        ("keys", "See docs/how-to/keys.md", lambda: check_keys(config)),
         ("permissions", "Run it as the service's user", lambda: _permissions(config, rig)),
         ("real-time rights", "See [sampler]", lambda: machine.check_realtime(config.sampler)),
         ("temperature", "Cool the unit", machine.check_temperature),

@@ -115,7 +115,7 @@ def check(
     from bricktrack_device.checks import run_checks
     from bricktrack_device.health.report import as_report, print_table
 
-    settings = _load(config, backend=backend, storage=storage, port=port, unit=unit)
+    settings = _as_configured(_load(config, backend=backend, storage=storage, port=port, unit=unit))
     rig = open_rig(settings)
     try:
         results = run_checks(settings, rig)
@@ -222,6 +222,13 @@ def _load(
     )
 
 
+def _as_configured(settings: "DeviceConfig") -> "DeviceConfig":
+    """Return the configuration with what hosts have set in it, as the daemon works by it."""
+    from bricktrack_device.remote_settings import RemoteSettings
+
+    return RemoteSettings(settings, settings.storage_folder).load()
+
+
 @contextmanager
 def _measuring(
     config: Path | None, backend: str | None, *, what: str
@@ -232,7 +239,7 @@ def _measuring(
 
     from bricktrack_device.backends import open_rig
 
-    settings = _load(config, backend=backend, storage=None, port=None, unit=None)
+    settings = _as_configured(_load(config, backend=backend, storage=None, port=None, unit=None))
     rig = open_rig(settings)
     try:
         with Progress(console=Console(stderr=True), transient=True) as bar:

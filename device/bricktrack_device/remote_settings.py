@@ -61,9 +61,9 @@ class RemoteSettings:
         What does not go with the unit's own file any more is left aside as a whole: the unit then works by
         its file, and `problem` says so.
         """
-        if not self._path.exists():
-            return self.config
         try:
+            if not self._is_there():
+                return self.config
             stored = load_json(self._path, _Configured, error=ConfigError)
             if stored.version != 1:
                 raise ConfigError(f"{self._path}: version {stored.version}; this bricktrack reads version 1")
@@ -73,6 +73,12 @@ class RemoteSettings:
             self.problem = f"what hosts have configured is not used: {e}. Configure it anew"
             logger.warning("%s", self.problem)
         return self.config
+
+    def _is_there(self) -> bool:
+        try:
+            return self._path.exists()
+        except OSError as e:
+            raise ConfigError(f"{self._path}: {e.strerror or e}") from e
 
     def change(self, values: Mapping[str, ConfigValue]) -> DeviceConfig:
         """Take all of some values, or none; return the configuration that results.

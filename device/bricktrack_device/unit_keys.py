@@ -49,7 +49,9 @@ class UnitKeys:
         try:
             self.own: KeyPair = read_secret_key(folder / UNIT_KEY_NAME)
         except ConfigError as e:
-            raise ConfigError(f"{e}. 'bricktrackd keys create' makes the unit's key") from e
+            if isinstance(e.__cause__, FileNotFoundError):
+                raise ConfigError(f"{e}. 'bricktrackd keys create' makes it") from e
+            raise
         self._stamp: _Stamp | None = None
         self._clients: dict[str, str] = {}
         self._problems_told: set[str] = set()
@@ -85,7 +87,8 @@ class UnitKeys:
         except OSError as e:
             self._stamp, self._clients = None, {}
             raise ConfigError(
-                f"{self.clients_folder}: the folder of hosts' keys cannot be read: {e.strerror or e}"
+                f"{self.clients_folder}: the folder of hosts' keys cannot be read: {e.strerror or e}. "
+                "'bricktrackd keys create' makes it"
             ) from e
         if stamp == self._stamp:
             return

@@ -47,7 +47,7 @@ def test_a_good_unit_passes_every_check(tmp_path: Path) -> None:
     # Temperature, supply and rights are this machine's own; the rest must be well.
     machine = {"temperature", "throttling", "real-time rights", "storage speed"}
     assert set(results) - machine == {
-        "clocks", "storage", "port", "permissions", "trigger", "trigger line", "camera", "sensor mode",
+        "clocks", "storage", "port", "keys", "permissions", "trigger", "trigger line", "camera", "sensor mode",
         "exposure", "leds", "imu brick", "bus of imu brick", "versions",
     }  # fmt: skip
     assert machine < set(results)
