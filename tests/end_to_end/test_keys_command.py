@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import UnitError, UnitTimeoutError
-from bricktrack_common.key_files import make_key_pair, read_secret_key
+from bricktrack_common.key_files import make_key_pair, read_public_key, read_secret_key
 from bricktrack_common.wire_messages import HelloReply, Request
 from bricktrack_device.file_server import Answer, FileServer
 from bricktrack_device.key_folder import create_unit_key
@@ -96,6 +96,10 @@ def test_keys_are_made_installed_and_used(lab: Laboratory) -> None:
     status, shown, _ = lab.bricktrack("show", "--json")
     assert json.loads(shown)["public"] == public.strip()
 
+    assert lab.bricktrack("show", "--output", str(lab.folder / "lab.txt"))[0] == 1
+    assert lab.bricktrack("show", "--output", str(lab.folder / "lab.key"))[0] == 0
+    assert read_public_key(lab.folder / "lab.key") == public.strip()
+
     before = lab.fleet.read_text()
     status, said, words = lab.by_ssh("install")
     assert status == 0 and "b1" in said and "(new)" in said, words
@@ -128,6 +132,7 @@ def test_rotation_changes_the_key_and_forbids_the_old_one(lab: Laboratory) -> No
     assert e.value.code == "not-allowed"
 
 
+@pytest.mark.slow
 def test_a_rotation_that_does_not_reach_every_unit_locks_nobody_out(lab: Laboratory) -> None:
     lab.bricktrack("create")
     lab.by_ssh("install")
@@ -145,6 +150,7 @@ def test_a_rotation_that_does_not_reach_every_unit_locks_nobody_out(lab: Laborat
     assert read_secret_key(lab.folder / "host.key_secret") == waiting
 
 
+@pytest.mark.slow
 def test_a_units_new_key_is_refused_until_it_is_installed(lab: Laboratory) -> None:
     lab.bricktrack("create")
     lab.by_ssh("install")

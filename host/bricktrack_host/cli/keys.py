@@ -11,7 +11,13 @@ import typer
 from rich.table import Table
 
 from bricktrack_common.errors import BricktrackError, ConfigError
-from bricktrack_common.key_files import KeyPair, fingerprint, read_secret_key
+from bricktrack_common.key_files import (
+    PUBLIC_SUFFIX,
+    KeyPair,
+    fingerprint,
+    read_secret_key,
+    write_public_key,
+)
 from bricktrack_host.cli._console import err, out, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
 from bricktrack_host.cli._units import FleetOption, JsonOption, TimeoutOption, fleet_path
@@ -67,15 +73,31 @@ def create(file: FileOption = None, fleet: FleetOption = None) -> None:
 
 
 @app.command()
-def show(file: FileOption = None, fleet: FleetOption = None, as_json: JsonOption = False) -> None:
+def show(
+    file: FileOption = None,
+    fleet: FleetOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Also write it to a file NAME.key, for the units."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
     """Print this host's public key, for 'bricktrackd keys allow' on the units.
 
     For example:
 
         bricktrack keys show
+
+        bricktrack keys show --output lab.key
     """
     path = _key_path(file, _fleet_if_any(fleet))
     public = read_secret_key(path).public
+    if output is not None:
+        if output.suffix != PUBLIC_SUFFIX:
+            raise ConfigError(
+                f"{output}: a public key's file ends in {PUBLIC_SUFFIX}, or units do not see it"
+            )
+        write_public_key(output, public, what=f"host {_host_name()}")
     if as_json:
         _print_json({"file": str(path), "public": public, "fingerprint": fingerprint(public)})
         return
