@@ -38,6 +38,11 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+_UNITS = "Units"
+_CAMERAS = "Cameras"
+_RUNS = "Runs and results"
+_JUDGE = "Try and judge"
+
 
 def _print_version(wanted: bool) -> None:
     if wanted:
@@ -60,27 +65,27 @@ def _options(
     set_up_logging(verbose)
 
 
-app.command("find")(find.find)
-app.command("status")(status.status)
-app.command("arm")(fleet.arm)
-app.command("disarm")(fleet.disarm)
-app.command("still")(still.still)
-app.command("configure")(configure.configure)
-app.command("delete")(delete.delete)
-app.add_typer(keys.app, name="keys")
-app.command("pull")(make_pull_command(process.process_pulled))
-app.command("import")(import_cmd.import_recording)
-app.command("target")(target.target)
+app.command("find", rich_help_panel=_UNITS)(find.find)
+app.command("status", rich_help_panel=_UNITS)(status.status)
+app.command("arm", rich_help_panel=_UNITS)(fleet.arm)
+app.command("disarm", rich_help_panel=_UNITS)(fleet.disarm)
+app.command("still", rich_help_panel=_UNITS)(still.still)
+app.command("configure", rich_help_panel=_UNITS)(configure.configure)
+app.command("delete", rich_help_panel=_UNITS)(delete.delete)
+app.add_typer(keys.app, name="keys", rich_help_panel=_UNITS)
+app.command("pull", rich_help_panel=_UNITS)(make_pull_command(process.process_pulled))
+app.command("import", rich_help_panel=_RUNS)(import_cmd.import_recording)
+app.command("target", rich_help_panel=_CAMERAS)(target.target)
 calibrate.app.command("leds")(calibrate_leds.leds)
-app.add_typer(calibrate.app, name="calibrate")
-app.command("process")(process.process)
-app.command("report")(process.report)
-app.command("align")(align.align)
-app.command("evaluate")(evaluate.evaluate)
-app.command("combine")(combine.combine)
-app.command("export")(export.export)
-app.command("overlay")(overlay.overlay)
-app.command("demo")(demo.demo)
+app.add_typer(calibrate.app, name="calibrate", rich_help_panel=_CAMERAS)
+app.command("process", rich_help_panel=_RUNS)(process.process)
+app.command("report", rich_help_panel=_RUNS)(process.report)
+app.command("align", rich_help_panel=_RUNS)(align.align)
+app.command("evaluate", rich_help_panel=_JUDGE)(evaluate.evaluate)
+app.command("combine", rich_help_panel=_RUNS)(combine.combine)
+app.command("export", rich_help_panel=_RUNS)(export.export)
+app.command("overlay", rich_help_panel=_RUNS)(overlay.overlay)
+app.command("demo", rich_help_panel=_JUDGE)(demo.demo)
 
 
 def main() -> None:
