@@ -50,7 +50,7 @@ class Aim:
     margins_px: tuple[float, float, float, float] | None
 
     @property
-    def n_leds(self) -> int:
+    def n_found(self) -> int:
         """How many LEDs were found."""
         return len(self.leds)
 
@@ -221,7 +221,7 @@ def draw(luma: NDArray[np.uint8], aim: Aim, *, title: str) -> NDArray[np.uint8]:
             write(words, (min(max(at[0] - width / 2, 4), columns - width - 4), max(at[1], 30 * size)), _GUIDE)
     for u, v, area in zip(*aim.others.uv_px.T, aim.others.area_px2, strict=True):
         cv2.circle(picture, (round(u), round(v)), round(np.sqrt(area / np.pi) + 4 * thick), _OTHER, thick)
-    for i in range(aim.n_leds):
+    for i in range(aim.n_found):
         u, v = aim.leds.uv_px[i]
         radius = float(np.sqrt(aim.leds.area_px2[i] / np.pi))
         colour = _DOUBTFUL if aim.leds.flags[i] else _GOOD

@@ -107,7 +107,7 @@ def _take(chosen: ChosenUnits, output: Path, *, dark: bool, as_json: bool, inden
             rows.append(row | {"ok": False, **error_details(e)})
             all_good = False
             continue
-        good = n_expected is None or look.aim.n_leds == n_expected
+        good = n_expected is None or look.aim.n_found == n_expected
         all_good = all_good and good
         rows.append(row | {"ok": good, "n_leds_expected": n_expected} | _for_scripts(look))
         if not as_json:
@@ -129,7 +129,7 @@ def _save(name: str, image: StillImage, data: bytes, folder: Path) -> _Look:
     plain_path, marked_path = folder / f"{name}.png", folder / f"{name}_leds.png"
     simulated = ", simulated" if image.simulated else ""
     title = (
-        f"{name}: {aim.n_leds} LEDs, edges {aim.focus_px:.1f} px, {image.exposure_us / 1000:g} ms{simulated}"
+        f"{name}: {aim.n_found} LEDs, edges {aim.focus_px:.1f} px, {image.exposure_us / 1000:g} ms{simulated}"
     )
     save_png(marked_path, draw(luma, aim, title=title))
     try:
@@ -141,7 +141,7 @@ def _save(name: str, image: StillImage, data: bytes, folder: Path) -> _Look:
 
 def _print(name: str, look: _Look, n_expected: int | None) -> None:
     aim = look.aim
-    count = f"{aim.n_leds} LEDs" if n_expected is None else f"{aim.n_leds} of {n_expected} LEDs"
+    count = f"{aim.n_found} LEDs" if n_expected is None else f"{aim.n_found} of {n_expected} LEDs"
     focus = "" if math.isnan(aim.focus_px) else f", edges {aim.focus_px:.1f} px wide (20 to 80 %)"
     out.print(f"{name}: {count}{focus}", markup=False)
     if len(aim.others):
@@ -155,8 +155,8 @@ def _print(name: str, look: _Look, n_expected: int | None) -> None:
     if n_bright:
         words = f"  {n_bright} LEDs are at full level: their edges look sharper than they are"
         err.print(words + ". Expose for less, or dim them", style="yellow", markup=False)
-    if n_expected is not None and aim.n_leds != n_expected:
-        say_error(f"{name}: {aim.n_leds} LEDs found; the layout has {n_expected} LEDs. See {look.marked}")
+    if n_expected is not None and aim.n_found != n_expected:
+        say_error(f"{name}: {aim.n_found} LEDs found; the layout has {n_expected} LEDs. See {look.marked}")
     image = look.image
     out.print(
         f"  {image.width_px} x {image.height_px}, {image.mode}, {image.exposure_us / 1000:g} ms, gain "
@@ -169,7 +169,7 @@ def _print(name: str, look: _Look, n_expected: int | None) -> None:
 def _for_scripts(look: _Look) -> dict[str, object]:
     aim, image = look.aim, look.image
     return {
-        "n_leds": aim.n_leds,
+        "n_leds": aim.n_found,
         "n_other_lights": len(aim.others),
         "edge_width_px": None if math.isnan(aim.focus_px) else round(aim.focus_px, 2),
         "leds": [

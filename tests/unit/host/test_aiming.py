@@ -23,7 +23,7 @@ def still(leds=LEDS, *, blur_px=0.0, radius=RADIUS, level=200, background=30, mo
 
 def test_leds_are_counted_from_left_to_right_and_reflections_are_not():
     aim = look_at(still(more=[(600.0, 100.0, 9.0)]))
-    assert aim.n_leds == 3
+    assert aim.n_found == 3
     assert len(aim.others) == 1
     assert aim.leds.uv_px == pytest.approx(
         np.array(LEDS), abs=0.1
@@ -47,7 +47,7 @@ def test_margins_are_from_the_leds_outlines_to_the_borders():
 
 def test_an_led_over_the_border_has_no_room_and_no_width():
     aim = look_at(still([(10.0, 200.0), *LEDS]))
-    assert aim.n_leds == 4
+    assert aim.n_found == 4
     assert aim.margins_px[0] == 0.0
     assert np.isnan(aim.edge_width_px[0])
     assert np.isfinite(aim.focus_px)
@@ -61,7 +61,7 @@ def test_full_level_is_told():
 def test_a_dark_picture_has_no_leds_and_is_still_drawn():
     luma = np.full((ROWS, COLUMNS), 18, np.uint8)
     aim = look_at(luma)
-    assert (aim.n_leds, aim.margins_px) == (0, None)
+    assert (aim.n_found, aim.margins_px) == (0, None)
     assert np.isnan(aim.focus_px)
     assert draw(luma, aim, title="dark").shape == (ROWS, COLUMNS, 3)
 
