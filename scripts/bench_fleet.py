@@ -27,9 +27,11 @@ from light_fleet import LightFleet, write_fleet_file  # noqa: E402 (the tests' s
 
 from bricktrack_common.checksums import sha256_file  # noqa: E402
 
-# What the host process runs: a command, then its own peak memory on a line of its own.
+# What the host process runs: a command, then its own peak memory on a line of its own; it may open as many files
+# as a process may on an ordinary machine.
 HOST = (
     "import resource, sys\n"
+    "resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))\n"
     "from bricktrack_host.cli import main\n"
     "try:\n"
     "    main()\n"

@@ -20,7 +20,7 @@ from run_folders import contents, make_run
 from typer.testing import CliRunner
 
 from bricktrack_common.key_files import make_key_pair, write_secret_key
-from bricktrack_common.wire_messages import Arm, Refusal, encode_message
+from bricktrack_common.wire_messages import Arm, DeleteRun, Refusal, encode_message
 from bricktrack_host.cli import app
 
 LAYOUT_OF_SEVEN = Path(__file__).parents[1] / "data" / "path-traced" / "layout.toml"
@@ -295,3 +295,40 @@ def test_status_watch_tells_again_and_again_and_ends_well(card, watcher):
         assert host.wait(20) == 0
     assert before["units"][0]["status"]["state"] == "idle"
     assert states[-1] == "armed"
+
+
+def test_another_software_is_told_and_another_protocol_is_an_error(many):
+    units, fleet = many
+    units["c-1"].software = "bricktrack 9.9.0"
+
+    def from_the_future(request, messages):
+        return [[msgpack.packb(msgpack.unpackb(m[0]) | {"protocol": 99}), *m[1:]] for m in messages]
+
+    units["c-2"].misbehave = from_the_future
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(
+        app, ["status", "--fleet", str(fleet), "--timeout", "1"]
+    )
+    assert result.exit_code == 1
+    assert "has bricktrack 9.9.0" in " ".join(result.stdout.split())
+    assert "c-2: " in result.stderr
+    assert "protocol version 99; this bricktrack speaks version" in result.stderr
+    assert "4 units: 3 idle, 1 no answer" in result.stdout
+
+
+def test_a_unit_that_is_asked_too_often_is_given_time(card):
+    with FakeUnit(card) as unit:
+        unit.confirmed |= {"fake_0001_a", "fake_0002_b"}
+        refused = []
+
+        def limit(request, messages):
+            if isinstance(request, DeleteRun) and not refused:
+                refused.append(request)
+                request_id = msgpack.unpackb(messages[0][0])["request_id"]
+                make_run(card, request.run_id, {"video.h264": 1000})  # it was not deleted after all
+                return [[encode_message(request_id, Refusal(code="too-many", message="ask less often"))]]
+            return messages
+
+        unit.misbehave = limit
+        result = invoke("delete", "--confirmed", "--yes", "-a", unit.address)
+    assert result.exit_code == 0, result.stderr
+    assert list(card.iterdir()) == []

@@ -1,13 +1,14 @@
 """``bricktrack delete``: runs removed from the units' cards, after a question."""
 
 import sys
+import time
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated
 
 import typer
 
-from bricktrack_common.errors import BricktrackError, ConfigError
+from bricktrack_common.errors import BricktrackError, ConfigError, UnitError
 from bricktrack_common.wire_messages import RunSummary
 from bricktrack_host.cli._acknowledged import ask_for, error_details, some_names
 from bricktrack_host.cli._console import err, out, print_json, say_error
@@ -23,6 +24,8 @@ from bricktrack_host.cli._units import (
 )
 from bricktrack_host.transfer.contact import Contact, ask_units
 from bricktrack_host.transfer.fleet_config import UnitConfig
+
+_TOO_MANY_WAIT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +154,7 @@ def _delete(
         name = contact.unit.name
         for run in of_unit[name]:
             try:
-                contact.client.delete_run(run.run_id, force=force)
+                _delete_one(contact, run, force=force)
             except BricktrackError as e:
                 problems.append((name, e))
             else:
@@ -161,3 +164,14 @@ def _delete(
     answers = ask_units(units, delete_all, dialer=chosen.dialer)
     problems += [(u.name, a) for u, a in zip(units, answers, strict=True) if isinstance(a, BricktrackError)]
     return gone, problems
+
+
+def _delete_one(contact: Contact, run: RunSummary, *, force: bool) -> None:
+    """Delete a run; a unit that is asked too often is given time."""
+    try:
+        contact.client.delete_run(run.run_id, force=force)
+    except UnitError as e:
+        if e.code != "too-many":
+            raise
+        time.sleep(_TOO_MANY_WAIT_S)
+        contact.client.delete_run(run.run_id, force=force)
