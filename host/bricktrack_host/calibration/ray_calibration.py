@@ -7,6 +7,7 @@ with what the covariance says of the places without dots.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -222,10 +223,10 @@ def choose_model(
             try:
                 tried[kind].append(_fitted(planes, kind, q, sensor_mode, tolerance))
             except CalibrationError:
-                # An order that the dots do not determine is no candidate, if another is.
-                if not tried[kind]:
+                # What the dots do not determine is no candidate, if something else is.
+                if not tried[kind] and len(tried) == 1:
                     raise
-    best = {kind: min(fits, key=lambda f: f.error.expected_um) for kind, fits in tried.items()}
+    best = {kind: min(fits, key=lambda f: f.error.expected_um) for kind, fits in tried.items() if fits}
     candidates = [f.error for fits in tried.values() for f in fits]
     if model != "auto":
         chosen = best[model]
@@ -239,14 +240,19 @@ def choose_model(
             else "order as asked"
         )
         return _choice(chosen, f"{chosen.error.name}: model as asked, {why}", candidates), chosen
-    if order == "held" and min(len(dots) for _, dots in planes) >= n_terms(PAPER_ORDER):
-        candidates.append(_fitted(planes, "two-plane", PAPER_ORDER, sensor_mode, tolerance).error)
+    if order == "held":
+        with suppress(CalibrationError):  # for comparison only
+            candidates.append(_fitted(planes, "two-plane", PAPER_ORDER, sensor_mode, tolerance).error)
     progress("test of one centre")
     central = best["central"]
     F, p = {}, {}
-    F["walking-pupil"], p["walking-pupil"] = _walk_test(best["walking-pupil"].fit)
-    F["two-plane"], p["two-plane"] = centrality_test(planes, central.error.order, sensor_mode=sensor_mode)
-    others = [best[k] for k in ("walking-pupil", "two-plane")]
+    if "walking-pupil" in best:
+        F["walking-pupil"], p["walking-pupil"] = _walk_test(best["walking-pupil"].fit)
+    if "two-plane" in best:
+        F["two-plane"], p["two-plane"] = centrality_test(planes, central.error.order, sensor_mode=sensor_mode)
+    others = [best[k] for k in kinds[1:] if k in best]
+    if not others:
+        return _choice(central, "central: the dots are too few for another model", candidates), central
     other = min(others, key=lambda f: f.error.expected_um)
     kind = other.error.model
     rejected = p[kind] < NOT_CENTRAL_P

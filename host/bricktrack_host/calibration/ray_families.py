@@ -7,8 +7,7 @@ made of Legendre products of the scaled pixel (`calibration.pixel_legendre`); V 
 - walking pupil: ``(x, y) = (x0, y0) + (z - z0 - w |P|^2) P``: the steeper a ray, the farther along the axis
   it crosses it; parameters as before, then w;
 - two-plane: ``(x, y) = N + (z - z_c) P`` with free N; parameters [P_x, N_x, P_y, N_y]. N and P together are
-the
-  paper's polynomials at planes A and B; kept apart because a lens that is nearly central has a small N.
+  the paper's polynomials at planes A and B; kept apart because a lens that is nearly central has a small N.
 """
 
 from dataclasses import dataclass

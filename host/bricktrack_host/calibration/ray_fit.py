@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.calibration.dot_data import DotData, central_start
-from bricktrack_host.calibration.pixel_legendre import term_degrees
 from bricktrack_host.calibration.pixel_polynomials import UNDETERMINED, n_terms
 from bricktrack_host.calibration.ray_families import (
     ALWAYS_FREE,
@@ -80,10 +79,6 @@ class RayFit:
         Fit less truth at each plane's dots, at their depth, nearest plane first.
     noise : tuple of PlaneNoise
     rig : tuple of RigUnknown
-    chi2 : float
-        Sum of squares of the whitened residuals.
-    n_effective : float
-        Parameters that the dots determine.
     whitened_rows, whitened_residual : ndarray, shapes (2 n, k) and (2 n,)
         Of the parameters fitted, to leave dots out.
     fitted_covariance : ndarray, shape (k, k)
@@ -98,8 +93,6 @@ class RayFit:
     residual_mm: tuple[FloatArray, ...]
     noise: tuple[PlaneNoise, ...]
     rig: tuple[RigUnknown, ...]
-    chi2: float
-    n_effective: float
     whitened_rows: FloatArray
     whitened_residual: FloatArray
     fitted_covariance: FloatArray
@@ -341,8 +334,6 @@ class _Fitter:
             residual_mm=tuple(np.split(-residual, counts)),
             noise=tuple(self.noise),
             rig=self.unknowns.results(self.rig, sd),
-            chi2=float(y @ y),
-            n_effective=float(np.sum((rows @ S) * rows)),
             whitened_rows=rows,
             whitened_residual=-y,
             fitted_covariance=S,
@@ -392,9 +383,3 @@ def _scatter(residual_px: FloatArray, cov_px2: FloatArray, freedom: float) -> Pl
         middle = (low + high) / 2
         low, high = (middle, high) if squares(middle) > freedom else (low, middle)
     return PlaneNoise(added_px=high)
-
-
-def held_degrees(fit: RayFit) -> IntArray:
-    """Return the degrees of the slopes' polynomials above `FREE_ORDER` that a held fit kept."""
-    degrees = np.unique(term_degrees(fit.order))
-    return np.asarray(degrees[degrees > FREE_ORDER])

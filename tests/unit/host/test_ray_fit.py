@@ -152,6 +152,18 @@ def test_a_covariance_that_is_none_is_refused():
         fit_central_rays([(a_mm, wrong), b], sensor_mode=IMX219_1080P)
 
 
+def test_a_small_target_gets_the_model_that_its_dots_carry():
+    board = Board(columns=10, rows=6)
+    fitted = calibrate_rays(two_planes(brown, 1, board=board), sensor_mode=IMX219_1080P, dot_diameter_mm=1e-3)
+    assert fitted.choice.model == "central"
+    # Beyond its dots nothing is known, and that is said: 10 dots of 4 mm are a third of the picture's width.
+    sd_mm = fitted.model.point_sd_mm([[960.0, 540.0], [20.0, 20.0]], A_MM)
+    assert sd_mm[0] < 2e-3 < 2e-2 < sd_mm[1]
+    with pytest.raises(CalibrationError, match="only 1[23] dots; held degrees need 30"):
+        few = [(z, d.select(np.arange(len(d)) % (len(d) // 12) == 3)) for z, d in two_planes(brown, 1)]
+        calibrate_rays(few, sensor_mode=IMX219_1080P, dot_diameter_mm=1e-3)
+
+
 def test_a_third_plane_bears_on_the_rays():
     rng = np.random.default_rng(3)
     planes = [(z, see(brown, z, rng)) for z in (A_MM, 130.0, B_MM)]

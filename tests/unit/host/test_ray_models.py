@@ -216,13 +216,13 @@ def test_the_covariance_is_that_of_repeated_calibrations():
 def test_two_plane_covariance_is_that_of_repeated_calibrations():
     uv = np.array([[960.0, 540.0], [660.0, 300.0]])
     points, sd = [], []
-    for seed in range(40):
+    for seed in range(20):
         a, b = (see(z, columns=20, noise_px=0.3, seed=100 * z + seed) for z in (A_MM, B_MM))
         model = fit_two_plane_irt([(A_MM, a), (B_MM, b)], sensor_mode=IMX219_1080P)
         points.append(model.points_on_plane(uv, 140.0))
         sd.append(model.point_sd_mm(uv, 140.0))
     spread = np.std(points, axis=0).mean(axis=1)
-    np.testing.assert_allclose(spread / np.mean(sd, axis=0), 1.0, atol=0.35)
+    np.testing.assert_allclose(spread / np.mean(sd, axis=0), 1.0, atol=0.45)  # 20 samples know it to 16 %
 
 
 def test_too_little_is_refused_with_words():
