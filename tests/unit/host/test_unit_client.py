@@ -5,16 +5,20 @@ import time
 
 import msgpack
 import pytest
+import zmq
 from fake_unit import FakeUnit
 from run_folders import make_run
 
-from bricktrack_common.errors import ProtocolError, TransferError, UnitError, UnitTimeoutError
+from bricktrack_common.errors import ConfigError, ProtocolError, TransferError, UnitError, UnitTimeoutError
+from bricktrack_common.key_files import make_key_pair
 from bricktrack_common.wire_messages import (
+    MAX_CHUNK_BYTES,
     Confirmed,
     Disarmed,
     GetStatus,
     Read,
     Refusal,
+    TakeStill,
     encode_message,
 )
 from bricktrack_host.transfer.unit_client import Stopped, UnitClient
@@ -222,3 +226,84 @@ def test_waiting_ends_when_told_to_stop(runs):
         with pytest.raises(Stopped):
             client.hello()
         assert time.monotonic() - began < 5
+
+
+def test_a_still_comes_whole_in_one_frame_or_in_pieces(runs):
+    picture = bytes(range(256)) * 12_000  # 3 MB
+
+    def cut(request, messages):
+        if not isinstance(request, TakeStill):
+            return messages
+        head, data = messages[0]
+        return [[head, *(data[i : i + MAX_CHUNK_BYTES] for i in range(0, len(data), MAX_CHUNK_BYTES))]]
+
+    with FakeUnit(runs, misbehave=cut) as unit, UnitClient(unit.address) as client:
+        unit.picture = picture
+        said, data = client.still(encoding="jpeg", lit=False)
+        assert data == picture and said.n_bytes == len(picture)
+        assert unit.requests[-1] == TakeStill(encoding="jpeg", lit=False)
+        unit.picture = picture[:10]
+        assert client.still()[1] == picture[:10]
+
+
+def test_a_still_that_comes_broken_or_short_is_refused(runs):
+    def break_it(request, messages):
+        head, data = messages[0]
+        return [[head, b"\xff" + data[1:]]]
+
+    def shorten(request, messages):
+        return [[messages[0][0], messages[0][1][:-1]]]
+
+    for misbehave in (break_it, shorten):
+        with FakeUnit(runs, misbehave=misbehave) as unit, UnitClient(unit.address) as client:
+            unit.picture = b"0123456789"
+            with pytest.raises(TransferError, match="came broken.*ask again"):
+                client.still()
+
+
+def test_a_still_without_end_is_not_taken_for_one(runs):
+    def flood(request, messages):
+        return [[messages[0][0], *[b"x"] * 17]]  # sixteen pieces of 1 MiB are the most
+
+    with (
+        FakeUnit(runs, misbehave=flood) as unit,
+        UnitClient(unit.address, timeout_s=0.5) as client,
+        pytest.raises(UnitTimeoutError, match="1 messages came that are not bricktrack's"),
+    ):
+        unit.picture = b"x"
+        client.still(timeout_s=0.5)
+
+
+def test_deleting_and_configuring_ask_as_they_are_told(runs):
+    with FakeUnit(runs) as unit, UnitClient(unit.address) as client:
+        with pytest.raises(UnitError, match="no host has run") as e:
+            client.delete_run(RUN)
+        assert e.value.code == "not-confirmed"
+        assert client.delete_run(RUN, force=True).n_bytes > 100_000
+        assert client.configure().changed == []
+        done = client.configure({"camera.exposure_us": 900})
+        assert done.values["camera.exposure_us"] == 900 and done.changed == ["camera.exposure_us"]
+        assert client.configure({"camera.exposure_us": None}).changed == []
+
+
+def test_keys_that_are_none_or_missing_are_an_error_before_anything_is_sent():
+    pair = make_key_pair()
+    with pytest.raises(ConfigError, match="server_key.*is no key"):
+        UnitClient("tcp://127.0.0.1:1", server_key="short", own_keys=pair)
+    with pytest.raises(ConfigError, match="bricktrack keys create"):
+        UnitClient("tcp://127.0.0.1:1", server_key=pair.public)
+
+
+def test_many_clients_of_one_context_leave_no_socket_behind(runs):
+    context = zmq.Context()
+    context.max_sockets = 12
+    with FakeUnit(runs) as unit:
+        for _ in range(40):
+            with UnitClient(unit.address, context=context) as client:
+                assert client.hello().unit == "fake"
+        with (
+            UnitClient("tcp://127.0.0.1:1", context=context, timeout_s=0.05) as client,
+            pytest.raises(UnitTimeoutError),
+        ):
+            client.hello()
+    context.term()
