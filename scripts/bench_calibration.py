@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -33,7 +34,7 @@ SIZE = (1280, 720)
 
 
 def main() -> int:
-    n_wrong = boards()
+    n_wrong = boards(coded=True) + boards(coded=False)
     root = os.environ.get("BRICKTRACK_SAMPLES")
     if root is None:
         print("\nBRICKTRACK_SAMPLES is not set: no path-traced sample, no times")
@@ -43,18 +44,20 @@ def main() -> int:
     return 1 if n_wrong else 0
 
 
-def boards() -> int:
+def boards(*, coded: bool) -> int:
     """Draw boards with faults; return how many dots got a wrong place."""
-    print(f"{N_BOARDS} drawn boards (simulated), {SIZE[0]} x {SIZE[1]} px, coded 40 x 26, pitch 4 mm")
+    kind, most_deg = ("coded", 180.0) if coded else ("plain, a pixel near the origin told", 60.0)
+    print(f"{N_BOARDS} drawn boards (simulated), {SIZE[0]} x {SIZE[1]} px, 40 x 26 dots, {kind}")
+    print(f"  turned by up to {most_deg:g} degrees")
     rng = np.random.default_rng(2026)
-    target = DotTarget(columns=40, rows=26, pitch_mm=4.0, diameter_mm=2.0)
+    target = DotTarget(columns=40, rows=26, pitch_mm=4.0, diameter_mm=2.0, coded=coded)
     right = refused = n_wrong = n_placed = n_whole = peer_found = 0
     errors, ratios, took, peer_took = [], [], 0.0, 0.0
     for k in range(N_BOARDS):
         camera = camera_of(*SIZE, k1=rng.uniform(-0.3, 0.1), k2=rng.uniform(0, 0.08))
         pose = BoardPose(
             (rng.uniform(-35, 35), rng.uniform(-20, 20), rng.uniform(95, 165)),
-            rng.uniform(-180, 180),
+            rng.uniform(-most_deg, most_deg),
             rng.uniform(-15, 15),
             rng.uniform(-15, 15),
         )
@@ -76,15 +79,19 @@ def boards() -> int:
                 seed=k,
             ),
         )
+        near = camera.project(np.array([pose.at_mm])).uv_px[0] + rng.uniform(-4, 4, 2)
         start = time.perf_counter()
         try:
-            _, placed = place_dots(picture.grey, target)
+            _, placed = place_dots(picture.grey, target, origin=None if coded else GridOrigin(tuple(near)))
         except CalibrationError as e:
             refused += 1
-            print(f"  board {k} refused: {e}")
+            print(f"  board {k}, turned by {pose.turn_deg:.0f}, refused: {e}")
             placed = None
         took += time.perf_counter() - start
         if placed is not None:
+            # A plain target's columns are counted from the first one seen; its millimetres are its places.
+            column_row = np.rint(placed.xy_mm / 4.0 + [19.5, 12.5]).astype(int)
+            placed = replace(placed, column_row=column_row) if not coded else placed
             wrong, good = wrong_and_right(placed, picture, within_px=3.0)
             n_wrong += wrong
             right += wrong == 0

@@ -91,6 +91,7 @@ def assign_grid(
             raise CalibrationError(
                 f"the grid found has {seen[0]} columns and {seen[1]} rows, the target only {columns} x "
                 f"{rows}; check the target's numbers and that no other dots are in view"
+                + (", or turn the board by 90 degrees" if seen[0] <= rows and seen[1] <= columns else "")
             )
         zero = _origin_steps(chosen.uv_px, ij, near, columns=columns, rows=rows, at=origin.at)
     return DotObservations(

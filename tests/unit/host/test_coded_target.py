@@ -52,6 +52,34 @@ def test_every_dot_placed_has_its_own_place(pose, faults):
     assert abs((board_turn_deg(dots) - pose.turn_deg + 180) % 360 - 180) < 4.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(8))
+def test_boards_with_every_fault_at_once_are_read_right_or_refused(seed):
+    rng = np.random.default_rng([seed, 77])
+    pose = BoardPose(
+        (rng.uniform(-25, 25), rng.uniform(-15, 15), rng.uniform(90, 160)),
+        rng.uniform(-180, 180), rng.uniform(-15, 15), rng.uniform(-15, 15),
+    )  # fmt: skip
+    a, b = rng.uniform(0.25, 1.1, 2)
+    faults = Faults(
+        hidden_share=0.3,
+        light=lambda u, v: (a * (1 - u) + b * u) * (1 - 0.3 * v),
+        blur_px=rng.uniform(0.3, 2),
+        noise=rng.uniform(0.003, 0.02),
+        n_reflections=int(rng.integers(0, 8)),
+        glare=rng.uniform(0, 0.3),
+        seed=seed,
+    )
+    picture = picture_of_board(TARGET, camera_of(k1=rng.uniform(-0.3, 0.1)), pose, faults=faults, samples=2)
+    try:
+        dots = assign_coded_grid(detect_dots(picture.grey), TARGET)
+    except CalibrationError:
+        return
+    wrong, right = wrong_and_right(dots, picture, within_px=3.0)
+    assert wrong == 0
+    assert right > 0.7 * np.count_nonzero(picture.whole)
+
+
 def test_the_pixel_noise_of_a_clean_picture_is_what_the_covariance_says():
     small = DotTarget(columns=17, rows=11, pitch_mm=4.0, diameter_mm=2.0)
     picture = picture_of_board(
