@@ -84,6 +84,7 @@ def simulate_run(
     clock_ppm: float | None = None,
     acc_range_g: int = 16,
     outlier_share: float = 0.0,
+    late_share: float = 0.0,
 ) -> DaemonRun:
     """Return one run: a second of rest, a shake, a second of rest.
 
@@ -96,6 +97,8 @@ def simulate_run(
         By how much the chip's clock is slow; else the seed says.
     outlier_share : float
         Of LED centroids that are up to 8 px off.
+    late_share : float
+        Of inertial reads that an overloaded machine makes up to 35 ms late; slots gone by are skipped.
     """
     settings = SimSettings(
         seed=seed,
@@ -124,7 +127,7 @@ def simulate_run(
         led_profile=ProfileEntry(collar_mm=_COLLAR_MM, source="simulated"),
     )
     observations = _observe(world, camera, brick, rng, duration_s, centroid_sd_px, outlier_share)
-    imu = _sample(world, rng, duration_s, stamp_offset_ns, acc_range_g)
+    imu = _sample(world, rng, duration_s, stamp_offset_ns, acc_range_g, late_share)
     return DaemonRun(observations, imu, camera, brick, world, stamp_offset_ns)
 
 
@@ -166,7 +169,12 @@ def _observe(
 
 
 def _sample(
-    world: SimWorld, rng: np.random.Generator, duration_s: float, stamp_offset_ns: int, acc_range_g: int
+    world: SimWorld,
+    rng: np.random.Generator,
+    duration_s: float,
+    stamp_offset_ns: int,
+    acc_range_g: int,
+    late_share: float,
 ) -> ImuTrack:
     sensors = ImuSensors(world, on_camera=False, stream=1)
     chip = Bno055Chip(bytes(16), sensors.measure, period_s=chip_period_s(world.settings, 1))
@@ -191,10 +199,15 @@ def _sample(
         period_ns=_PERIOD_NS,
         t0_ns=t0_ns,
     )
-    records = []
+    records: list[ImuRecord] = []
+    late = np.random.default_rng([world.settings.seed, 78])
     for slot in range(int((duration_s + 0.8) * 100)):
         # A wake-up is late by some 30 us, now and then by more; a burst takes 1.3 ms, give or take.
-        before = t0_ns + slot * _PERIOD_NS + round(abs(rng.normal(0, 3e4)) + (rng.random() < 0.01) * 4e5)
+        due = t0_ns + slot * _PERIOD_NS
+        if records and due < records[-1].t_after_ns:
+            continue
+        before = due + round(abs(rng.normal(0, 3e4)) + (rng.random() < 0.01) * 4e5)
+        before += round((late.random() < late_share) * late.uniform(0, 3.5e7))
         after = before + round(1.3e6 + abs(rng.normal(0, 2e4)))
         data = chip.read(FIRST_REGISTER, N_DATA_BYTES, (before + after) // 2)
         records.append(ImuRecord(slot, before, after, data, 0, None))

@@ -99,9 +99,14 @@ class SawToothSearch:
         self._is_repeat = (imu.flags & int(ImuFlag.REPEAT)) != 0
         self._fresh = usable_samples(imu)
         # The slot of each read, and when a read in the middle one would be, were it as late as most.
-        step = np.round(np.diff(self._read_s) / signal.period_s)
-        slot = np.concatenate([[0], np.cumsum(step)]).astype(np.int64)
-        half = len(slot) // 2
+        half = len(self._read_s) // 2
+        slot = np.arange(len(self._read_s))
+        by_row_s = float(np.median(self._read_s[half : 2 * half] - self._read_s[:half])) / half
+        if (
+            abs(by_row_s / signal.period_s - 1) > _MAX_RATE_ERROR
+        ):  # rows are left out: there is not one a slot
+            step = np.round(np.diff(self._read_s) / signal.period_s)
+            slot = np.concatenate([[0], np.cumsum(step)]).astype(np.int64)
         far = slot[half:] - slot[: len(slot) - half]
         self.period_s = float(np.median((self._read_s[half:] - self._read_s[: len(slot) - half]) / far))
         late_s = float(np.median(self._read_s - slot * self.period_s))
