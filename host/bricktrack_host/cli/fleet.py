@@ -72,11 +72,11 @@ def arm(
         if runs:
             say_error("those that are armed stay so; 'bricktrack disarm' brings them back")
         raise typer.Exit(EXIT_ERROR)
-    if wait and not _wait_until_saved(chosen, runs, as_json=as_json):
+    if wait and not wait_until_saved(chosen, runs, as_json=as_json):
         raise typer.Exit(EXIT_ERROR)
 
 
-def _wait_until_saved(chosen: ChosenUnits, runs: dict[str, str], *, as_json: bool) -> bool:
+def wait_until_saved(chosen: ChosenUnits, runs: dict[str, str], *, as_json: bool) -> bool:
     """Poll until every unit has its run on the card, or cannot have it; tell whether all have."""
     waiting = list(chosen.units)
     heard_s = {u.name: time.monotonic() for u in waiting}

@@ -21,9 +21,11 @@ from bricktrack_host.cli import (
     keys,
     overlay,
     process,
+    report,
     status,
     still,
     target,
+    test_day,
 )
 from bricktrack_host.cli._console import out, set_up_logging
 from bricktrack_host.cli._errors import BricktrackGroup
@@ -79,12 +81,13 @@ app.command("target", rich_help_panel=_CAMERAS)(target.target)
 calibrate.app.command("leds")(calibrate_leds.leds)
 app.add_typer(calibrate.app, name="calibrate", rich_help_panel=_CAMERAS)
 app.command("process", rich_help_panel=_RUNS)(process.process)
-app.command("report", rich_help_panel=_RUNS)(process.report)
+app.command("report", rich_help_panel=_RUNS)(report.report)
 app.command("align", rich_help_panel=_RUNS)(align.align)
 app.command("evaluate", rich_help_panel=_JUDGE)(evaluate.evaluate)
 app.command("combine", rich_help_panel=_RUNS)(combine.combine)
 app.command("export", rich_help_panel=_RUNS)(export.export)
 app.command("overlay", rich_help_panel=_RUNS)(overlay.overlay)
+app.add_typer(test_day.app, name="test", rich_help_panel=_UNITS)
 app.command("demo", rich_help_panel=_JUDGE)(demo.demo)
 
 

@@ -1,4 +1,4 @@
-"""``bricktrack process`` and ``bricktrack report``: runs into results, and results into a page."""
+"""``bricktrack process``: runs into results."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -138,16 +138,37 @@ def process(
             processed = wanted(runs[0], files, bar)
         say_processed(processed)
         return
-    ready: list[tuple[Path, tuple[Path, Path]]] = []
-    for run in runs:
-        try:
-            ready.append((run, _files_for(run, calibration, layout, fleet)))
-        except BricktrackError as e:
-            say_error(f"{run}: {e}")
-    failed = len(runs) - len(ready) + _process_many(ready, wanted, jobs)
+    failed = _process_all(
+        runs, partial(_files_for, calibration=calibration, layout=layout, fleet_file=fleet), wanted, jobs
+    )
     if failed:
         say_error(f"{failed} of {len(runs)} runs could not be processed")
         raise typer.Exit(EXIT_ERROR)
+
+
+def process_folders(runs: list[Path], *, fleet: Path, jobs: int | None) -> int:
+    """Process runs with what the fleet file names, say what became of each, and return how many failed."""
+    from bricktrack_host.pipeline import ProcessSettings
+
+    wanted = partial(_process_one, output=None, settings=ProcessSettings(), truth=None)
+    return _process_all(
+        runs, partial(_files_for, calibration=None, layout=None, fleet_file=fleet), wanted, jobs
+    )
+
+
+def _process_all(
+    runs: list[Path],
+    files_for: "Callable[[Path], tuple[Path, Path]]",
+    wanted: "Callable[..., ProcessedRun]",
+    jobs: int | None,
+) -> int:
+    ready: list[tuple[Path, tuple[Path, Path]]] = []
+    for run in runs:
+        try:
+            ready.append((run, files_for(run)))
+        except BricktrackError as e:
+            say_error(f"{run}: {e}")
+    return len(runs) - len(ready) + _process_many(ready, wanted, jobs)
 
 
 def _process_one(
@@ -219,45 +240,6 @@ def process_pulled(unit: UnitConfig, pulled: PulledRun) -> None:
             pulled.folder, calibration=unit.calibration_path, layout=unit.layout_path, progress=bar
         )
     say_processed(processed)
-
-
-def report(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="A processed run, or its results folder.")],
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="The page to write. \\[default: RESULTS/report.html]"),
-    ] = None,
-    truth: TruthOption = None,
-) -> None:
-    """Write the report of a processed run again, and print what it amounts to.
-
-    For example:
-
-        bricktrack report runs/b2_9f31c2_0007_shake
-
-        bricktrack report runs/sample_motion --truth tests/data/path-traced/truth
-    """
-    from bricktrack_host.pipeline import REPORT_NAME, RESULTS_FOLDER, find_truth
-    from bricktrack_host.reporting.report import ReportExtras, write_report
-    from bricktrack_host.reporting.report_pictures import PICTURES_NAME, load_pictures
-    from bricktrack_host.results.result_store import read_result
-    from bricktrack_host.results.run_summary import key_figures, verdict
-    from bricktrack_host.results.true_motion import read_true_motion
-    from bricktrack_host.results.truth import compare_with_truth
-
-    folder = run / RESULTS_FOLDER if (run / MANIFEST_NAME).is_file() else run
-    result = read_result(folder)
-    path = find_truth(run, truth)
-    comparison = None if path is None else compare_with_truth(result, read_true_motion(path))
-    page = output or folder / REPORT_NAME
-    overlays, covered = load_pictures(folder / PICTURES_NAME)
-    write_report(result, page, ReportExtras(overlays=overlays, calibration=covered, truth=comparison))
-    line, problems = verdict(result, key_figures(result))
-    out.print(f"{result.manifest.run_id}: {line}", markup=False, soft_wrap=True)
-    for problem in problems:
-        out.print(f"  {problem}", style="yellow", markup=False, soft_wrap=True)
-    say_truth(comparison)
-    out.print(f"report: {page}", markup=False, soft_wrap=True)
 
 
 def _files_for(

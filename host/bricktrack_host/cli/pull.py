@@ -152,7 +152,7 @@ def make_pull_command(process: ProcessHook | None = None) -> Callable[..., None]
         if watch:
             _watch(chosen, folder, settings, hook, every, as_json=as_json)
             return
-        results = _pull(chosen, folder, settings)
+        results = pull_with_bars(chosen, folder, settings)
         problems = [(r.unit, e) for r in results for e in r.errors] + _not_found(results, run)
         problems += _process_all(hook, chosen, results)
         if as_json:
@@ -169,7 +169,8 @@ def make_pull_command(process: ProcessHook | None = None) -> Callable[..., None]
 Problem = tuple[str, BricktrackError]
 
 
-def _pull(chosen: ChosenUnits, folder: Path, settings: PullSettings) -> list[UnitPull]:
+def pull_with_bars(chosen: ChosenUnits, folder: Path, settings: PullSettings) -> list[UnitPull]:
+    """Pull with a bar for each unit; Ctrl-C says how to go on."""
     columns = (
         TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(), TransferSpeedColumn(),
         TimeRemainingColumn(),
@@ -197,7 +198,7 @@ def _watch(
     told: dict[str, str] = {}
     n_pulled = 0
     while True:
-        results = _pull(chosen, folder, settings)
+        results = pull_with_bars(chosen, folder, settings)
         came = [UnitPull(r.unit, [p for p in r.runs if p.outcome == "pulled"], r.errors) for r in results]
         n_pulled += sum(len(r.runs) for r in came)
         problems = [(r.unit, e) for r in came for e in r.errors]

@@ -1,0 +1,280 @@
+"""``bricktrack test``: a shake from the look before it to the report after it, a step at a time."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from bricktrack_common.errors import BricktrackError, ConfigError
+from bricktrack_common.run_manifest import MANIFEST_NAME
+from bricktrack_common.wire_messages import Armed, StatusReply
+from bricktrack_host.campaign.test_plan import (
+    COMBINED_FOLDER,
+    PlannedTest,
+    is_of_test,
+    load_plan,
+    newest,
+    save_plan,
+    folder_of_test,
+)
+from bricktrack_host.cli._acknowledged import ask_for, report_answers
+from bricktrack_host.cli._console import err, out, say_error
+from bricktrack_host.cli._errors import EXIT_ERROR
+from bricktrack_host.cli._units import (
+    ChosenUnits,
+    FleetOption,
+    TimeoutOption,
+    UnitOption,
+    choose_units,
+    fleet_path,
+)
+from bricktrack_host.cli.combine import combine
+from bricktrack_host.cli.fleet import wait_until_saved
+from bricktrack_host.cli.process import process_folders
+from bricktrack_host.cli.pull import pull_with_bars
+from bricktrack_host.transfer.contact import Contact
+from bricktrack_host.transfer.fleet_config import UnitConfig
+from bricktrack_host.transfer.pull import PullSettings
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Take a shake from the look before it to the report after it. Each step may be given again: it goes "
+    "on where it was cut short.",
+)
+
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Of the test, as shake-12.")]
+
+
+@app.command()
+def new(
+    name: NameArgument,
+    unit: UnitOption = None,
+    duration: Annotated[
+        float | None,
+        typer.Option("--duration", min=0.1, max=600, help="Seconds to record instead of the unit's own."),
+    ] = None,
+    fleet: FleetOption = None,
+    timeout: TimeoutOption = 5.0,
+) -> None:
+    """Begin a test: note its units, and look whether each is ready.
+
+    Exits with 1 if one is not, and says what to do. Look again with 'bricktrack test check'.
+
+    For example:
+
+        bricktrack test new shake-12
+
+        bricktrack test new shake-12 --unit 'b7-*' --duration 20
+    """
+    chosen = choose_units(fleet, unit, None, timeout_s=timeout)
+    plan = PlannedTest(name=name, units=[u.name for u in chosen.units], duration_s=duration)
+    save_plan(folder_of_test(fleet_path(fleet), name), plan)
+    _look(chosen, name)
+
+
+@app.command()
+def check(name: NameArgument, fleet: FleetOption = None, timeout: TimeoutOption = 5.0) -> None:
+    """Look again whether each unit is ready.
+
+    For example:
+
+        bricktrack test check shake-12
+    """
+    _, chosen = _planned(name, fleet, timeout)
+    _look(chosen, name)
+
+
+@app.command()
+def arm(
+    name: NameArgument,
+    wait: Annotated[bool, typer.Option(help="Wait until the runs are recorded and saved.")] = True,
+    again: Annotated[
+        bool, typer.Option("--again", help="Record once more, also with units that have a run of this test.")
+    ] = False,
+    fleet: FleetOption = None,
+    timeout: TimeoutOption = 5.0,
+) -> None:
+    """Make all units of a test ready for the first edge, and wait for their runs.
+
+    Units that are armed for this test, or have a run of it, are left as they are. Exits with 1 if one is not
+    armed, or its run does not come. Ctrl-C ends the waiting; the units record all the same.
+
+    For example:
+
+        bricktrack test arm shake-12
+
+        bricktrack test arm shake-12 --again
+    """
+    plan, chosen = _planned(name, fleet, timeout)
+
+    def make_ready(contact: Contact) -> Armed:
+        now = contact.client.status()
+        if now.state in ("armed", "recording", "saving") and is_of_test(now.run_id, name):
+            return Armed(run_id=now.run_id, missing=[])
+        recorded = newest(r.run_id for r in contact.client.list_runs().runs if is_of_test(r.run_id, name))
+        if recorded is not None and not again:
+            return Armed(run_id=recorded, missing=[])
+        return contact.client.arm(name, duration_s=plan.duration_s)
+
+    answers = ask_for(chosen, make_ready, doing="arming")
+    all_armed = report_answers(
+        chosen.units, answers, done="armed or done", words=lambda a: f"run {a.run_id}", details=lambda _: {},
+        as_json=False,
+    )  # fmt: skip
+    armed = {u.name: a for u, a in zip(chosen.units, answers, strict=True) if isinstance(a, Armed)}
+    for unit, answer in armed.items():
+        for words in answer.missing:
+            err.print(f"{unit}: without {words}", style="yellow", markup=False, soft_wrap=True)
+    if not all_armed:
+        say_error(f"'bricktrack test arm {name}' arms the rest; 'bricktrack disarm' brings all back")
+        raise typer.Exit(EXIT_ERROR)
+    if not wait:
+        return
+    try:
+        good = wait_until_saved(
+            chosen, {unit: answer.run_id for unit, answer in armed.items()}, as_json=False
+        )
+    except KeyboardInterrupt as e:
+        raise KeyboardInterrupt(
+            f"Interrupted; the units stay armed. 'bricktrack test arm {name}' waits again."
+        ) from e
+    if not good:
+        raise typer.Exit(EXIT_ERROR)
+    out.print(f"all runs are saved; next: bricktrack test collect {name}", markup=False)
+
+
+@app.command()
+def collect(
+    name: NameArgument,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs", "-j", min=1, help="Runs processed at once. \\[default: as the machine allows]"
+        ),
+    ] = None,
+    fleet: FleetOption = None,
+    timeout: TimeoutOption = 5.0,
+) -> None:
+    """Bring the runs of a test here, verified, and process those that are not yet.
+
+    Exits with 1 if a unit's run is missing or could not be processed; given again it goes on.
+
+    For example:
+
+        bricktrack test collect shake-12
+    """
+    plan, chosen = _planned(name, fleet, timeout)
+    runs_folder = _runs_folder(chosen)
+    wanted: list[UnitConfig] = []
+    run_ids: list[str] = []
+    problems: list[str] = []
+    answers = ask_for(chosen, lambda c: c.client.list_runs(), doing="asking")
+    for unit, answer in zip(chosen.units, answers, strict=True):
+        if isinstance(answer, BricktrackError):
+            if unit.name not in _runs_here(runs_folder, plan):
+                problems.append(f"{unit.name}: {answer}")
+            continue
+        run_id = newest(r.run_id for r in answer.runs if is_of_test(r.run_id, name))
+        if run_id is not None:
+            wanted.append(unit)
+            run_ids.append(run_id)
+        elif unit.name not in _runs_here(runs_folder, plan):
+            problems.append(f"{unit.name}: has no run of {name}. Was it armed?")
+    if wanted:
+        pulled = pull_with_bars(replace(chosen, units=wanted), runs_folder, PullSettings(run_ids=run_ids))
+        problems += [f"{result.unit}: {e}" for result in pulled for e in result.errors]
+    here = _runs_here(runs_folder, plan)
+    todo = [run for run in here.values() if not _is_processed(run)]
+    out.print(f"{len(here)} of {len(plan.units)} runs are here, {len(todo)} to process", markup=False)
+    failed = process_folders(todo, fleet=fleet_path(fleet), jobs=jobs)
+    for problem in problems:
+        say_error(problem)
+    if problems or failed:
+        say_error(f"mend that, then 'bricktrack test collect {name}' goes on; 'report' takes what there is")
+        raise typer.Exit(EXIT_ERROR)
+    out.print(f"next: bricktrack test report {name}", markup=False)
+
+
+@app.command()
+def report(name: NameArgument, fleet: FleetOption = None) -> None:
+    """Compare the units of a test, solve its assemblies, and write its report.
+
+    For example:
+
+        bricktrack test report shake-12
+    """
+    path = fleet_path(fleet)
+    folder = folder_of_test(path, name)
+    plan = load_plan(folder)
+    runs = _runs_here(_runs_folder(choose_units(fleet, plan.units, None, timeout_s=1.0)), plan)
+    usable = [run for run in runs.values() if _is_processed(run)]
+    missing = [unit for unit in plan.units if unit not in runs or not _is_processed(runs[unit])]
+    if not usable:
+        raise ConfigError(f"{name}: no run is processed yet. Give 'bricktrack test collect {name}' first")
+    combine(usable, name, fleet, folder / COMBINED_FOLDER)
+    if missing:
+        say_error(f"without {', '.join(missing)}: not here, or not processed")
+        raise typer.Exit(EXIT_ERROR)
+
+
+def _planned(name: str, fleet: Path | None, timeout_s: float) -> tuple[PlannedTest, ChosenUnits]:
+    plan = load_plan(folder_of_test(fleet_path(fleet), name))
+    return plan, choose_units(fleet, plan.units, None, timeout_s=timeout_s)
+
+
+def _runs_folder(chosen: ChosenUnits) -> Path:
+    if chosen.fleet is None:
+        raise ConfigError("a test needs a fleet file")
+    return chosen.fleet.runs_path
+
+
+def _runs_here(runs_folder: Path, plan: PlannedTest) -> dict[str, Path]:
+    """Return the newest whole run of each unit of a test on this machine."""
+    runs = {
+        unit: newest(
+            path.name
+            for path in runs_folder.glob(f"{unit}_*_{plan.name}")
+            if is_of_test(path.name, plan.name) and (path / MANIFEST_NAME).is_file()
+        )
+        for unit in plan.units
+    }
+    return {unit: runs_folder / run_id for unit, run_id in runs.items() if run_id is not None}
+
+
+def _is_processed(run: Path) -> bool:
+    return (run / "results" / "summary.json").is_file()
+
+
+def _look(chosen: ChosenUnits, name: str) -> None:
+    """Say of each unit whether it can record this test, and the remedy where it cannot."""
+    answers = ask_for(chosen, lambda c: c.client.status(), doing="looking at")
+    table = Table(title=f"{name}: before the shake")
+    for header in ("unit", "ready", "because", "remedy"):
+        table.add_column(header)
+    n_ready = 0
+    for unit, answer in zip(chosen.units, answers, strict=True):
+        reasons = [(str(answer), "")] if isinstance(answer, BricktrackError) else _obstacles(answer, name)
+        n_ready += not reasons
+        for words, remedy in reasons:
+            table.add_row(unit.name, "[red]no[/]", words.replace("[", r"\["), remedy.replace("[", r"\["))
+    if table.row_count:
+        out.print(table)
+    out.print(f"{n_ready} of {len(chosen.units)} units are ready", markup=False)
+    if n_ready < len(chosen.units):
+        raise typer.Exit(EXIT_ERROR)
+    out.print(f"next: bricktrack test arm {name}", markup=False)
+
+
+def _obstacles(now: StatusReply, name: str) -> list[tuple[str, str]]:
+    """Return what keeps a unit from recording well, each with its remedy."""
+    found = [(f"{item.name}: {item.words}", item.remedy) for item in now.health if item.level == "fail"]
+    if now.state == "fault":
+        found.append((now.reason or now.last_error or "in fault", "'bricktrack disarm' clears it"))
+    elif now.state != "idle" and not is_of_test(now.run_id, name):
+        found.append((f"{now.state} for {now.run_id}", "Wait, or 'bricktrack disarm'"))
+    if now.disk_free_bytes < now.disk_needed_bytes:
+        free, needed = now.disk_free_bytes / 1e9, now.disk_needed_bytes / 1e9
+        found.append((f"{free:.1f} GB free; a run needs {needed:.1f} GB", "Pull its runs, then delete them"))
+    return found
