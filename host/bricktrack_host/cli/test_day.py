@@ -13,11 +13,11 @@ from bricktrack_common.wire_messages import Armed, StatusReply
 from bricktrack_host.campaign.test_plan import (
     COMBINED_FOLDER,
     PlannedTest,
+    folder_of_test,
     is_of_test,
     load_plan,
     newest,
     save_plan,
-    folder_of_test,
 )
 from bricktrack_host.cli._acknowledged import ask_for, report_answers
 from bricktrack_host.cli._console import err, out, say_error
