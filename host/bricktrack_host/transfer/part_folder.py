@@ -6,7 +6,8 @@ opens the folder again reads every range and compares, so that a power cut that 
 costs only those ranges. A killed pull loses nothing but the chunks that were on the network.
 
 While bytes come in, one thread behind each folder hashes what lies there without a gap, as read back from the
-file, and syncs it, so that little is left to do when the last chunk is here.
+file, so that little is left to do when the last chunk is here. The system writes to the disk meanwhile; a
+file is synced once, when it is whole.
 """
 
 import fcntl
@@ -28,7 +29,7 @@ from bricktrack_host.durable_files import rename_durably, sync_folder, write_dur
 
 JOURNAL_NAME = ".journal.jsonl"  # begins with a dot, which no file of a run may
 JOURNAL_VERSION = 1
-_SETTLE_BYTES = 16 * 1024 * 1024  # hashed and synced at a time, behind the transfer
+_HASH_BYTES = 8 * 1024 * 1024  # hashed at a time, behind the transfer
 _READ_BYTES = 1024 * 1024
 
 
@@ -61,7 +62,7 @@ class _PartFile:
         self.verified: list[_Range] = []
         self.n_bytes_verified = 0
         self.n_bytes_without_gap = 0
-        self.n_bytes_settling = 0
+        self.n_bytes_to_hash = 0
         self._ends_ahead: dict[int, int] = {}  # behind the first hole: the end of a range by its start
         self._digest = hashlib.sha256()
         self._n_bytes_hashed = 0
@@ -79,20 +80,18 @@ class _PartFile:
         end = other.offset + other.n_bytes
         return any(r.offset < end and other.offset < r.offset + r.n_bytes for r in self.verified)
 
-    def settle(self, end: int) -> None:
-        """Hash the file up to ``end`` as it is on disk, and sync it; for one thread only."""
+    def hash_to(self, end: int) -> None:
+        """Hash the file up to ``end``, as it is on disk; for one thread only."""
         while self._n_bytes_hashed < end:
-            data = os.pread(
-                self.handle.fileno(), min(_READ_BYTES, end - self._n_bytes_hashed), self._n_bytes_hashed
-            )
+            n_bytes = min(_READ_BYTES, end - self._n_bytes_hashed)
+            data = os.pread(self.handle.fileno(), n_bytes, self._n_bytes_hashed)
             if not data:
-                break  # cut short behind our back: the hash will tell
+                return  # cut short behind our back: the hash will tell
             self._digest.update(data)
             self._n_bytes_hashed += len(data)
-        os.fsync(self.handle.fileno())
 
     def sha256(self) -> str:
-        """Return the hash of what has settled, as 64 hex digits."""
+        """Return the hash of what was hashed, as 64 hex digits."""
         return self._digest.hexdigest()
 
 
@@ -105,8 +104,8 @@ class PartFolder:
         self._lock = lock
         self._journal: BinaryIO | None = None
         self._files: dict[str, _PartFile] = {}
-        self._behind = ThreadPoolExecutor(1, f"settle-{description.run_id}")
-        self._settling: list[Future[None]] = []
+        self._behind = ThreadPoolExecutor(1, f"hash-{description.run_id}")
+        self._hashing: list[Future[None]] = []
 
     @classmethod
     def open(cls, path: Path, description: RunDescription, *, note: Callable[[str], None]) -> Self:
@@ -183,28 +182,29 @@ class PartFolder:
         if self._journal is not None:
             self._journal.write(msgspec.json.encode(done) + b"\n")
         file.add(done)
-        if file.n_bytes_without_gap >= file.n_bytes_settling + _SETTLE_BYTES:
-            self._settle(file)
+        if file.n_bytes_without_gap >= file.n_bytes_to_hash + _HASH_BYTES:
+            self._hash(file)
 
     def sha256(self, name: str) -> str:
-        """Return the hash of a file as it is on disk, and synced; waits until it is."""
+        """Return the hash of a file as it is on disk; what was written is synced when this returns."""
         file = self._files[name]
-        self._settle(file)
-        self._wait_until_settled()
+        self._hash(file)
+        os.fsync(file.handle.fileno())
+        self._wait_until_hashed()
         return file.sha256()
 
-    def _settle(self, file: _PartFile) -> None:
-        file.n_bytes_settling = file.n_bytes_without_gap
-        self._settling.append(self._behind.submit(file.settle, file.n_bytes_settling))
+    def _hash(self, file: _PartFile) -> None:
+        file.n_bytes_to_hash = file.n_bytes_without_gap
+        self._hashing.append(self._behind.submit(file.hash_to, file.n_bytes_to_hash))
 
-    def _wait_until_settled(self) -> None:
-        settling, self._settling = self._settling, []
-        for work in settling:
+    def _wait_until_hashed(self) -> None:
+        hashing, self._hashing = self._hashing, []
+        for work in hashing:
             work.result()
 
     def set_aside(self, name: str) -> Path:
         """Keep a wrong file beside the folder, as ``<run-id>.bad-N.<name>``, and begin it anew."""
-        self._wait_until_settled()
+        self._wait_until_hashed()
         old = self._files.pop(name)
         old.handle.close()
         evidence = _free_name(self.path.with_suffix(""), ending=f".{name}")
@@ -215,8 +215,7 @@ class PartFolder:
         return evidence
 
     def finish(self) -> None:
-        """Make everything durable, the names too; the folder may then be renamed."""
-        self._wait_until_settled()
+        """Make the names durable; the folder may then be renamed, if the hash of each file was asked for."""
         sync_folder(self.path)
 
     @staticmethod

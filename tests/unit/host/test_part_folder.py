@@ -35,10 +35,10 @@ def fill(part, chunks):
         part.write("video.h264", offset, DATA[offset : offset + n_bytes])
 
 
-@pytest.mark.parametrize("settle_bytes", [1, 200_000, 10**9])
-def test_chunks_in_any_order_make_the_file_and_its_hash(path, monkeypatch, settle_bytes):
+@pytest.mark.parametrize("hash_bytes", [1, 200_000, 10**9])
+def test_chunks_in_any_order_make_the_file_and_its_hash(path, monkeypatch, hash_bytes):
     """The hash is worked out behind the writing, up to the first hole, however often that is done."""
-    monkeypatch.setattr(part_folder, "_SETTLE_BYTES", settle_bytes)
+    monkeypatch.setattr(part_folder, "_HASH_BYTES", hash_bytes)
     shuffled = random.Random(3).sample(CHUNKS, len(CHUNKS))
     with PartFolder.open(path, describe(), note=fail) as part:
         fill(part, shuffled)
