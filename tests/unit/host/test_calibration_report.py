@@ -40,8 +40,18 @@ def turned_far_board():
             (B_MM, see(brown, B_MM, rng, board=Board(turn_deg=(0.08, 0.0, 0.0))))]  # fmt: skip
 
 
-def test_a_page_against_an_earlier_calibration(tmp_path):
-    fitted, made = calibrated(two_planes(brown, 3), model="central")
+@pytest.fixture(scope="module")
+def plain():
+    return calibrated(two_planes(brown, 3), model="central")
+
+
+@pytest.fixture(scope="module")
+def turned():
+    return calibrated(turned_far_board(), model="central")
+
+
+def test_a_page_against_an_earlier_calibration(plain, tmp_path):
+    fitted, made = plain
     _, earlier = calibrated(two_planes(brown, 4), model="two-plane")
     page = tmp_path / "page.html"
     write_calibration_report(page, fitted, made, earlier=earlier, pictures_dir=tmp_path / "png")
@@ -72,8 +82,8 @@ def test_a_page_lists_what_was_found_of_the_rig(tmp_path):
     assert "plane 2: turn about x" in html and "no: the tolerance stands" in html
 
 
-def test_the_verdict_warns_of_a_rig_that_the_pictures_contradict():
-    fitted, made = calibrated(turned_far_board(), model="central")
+def test_the_verdict_warns_of_a_rig_that_the_pictures_contradict(turned):
+    fitted, made = turned
     line, problems = verdict(gathered_evidence(fitted, made))
     assert "um from the rays on average" in line
     assert any(re.search(r"plane 2: turn about x by 0\.0[78]\d ± 0\.00\d", p) for p in problems)
@@ -85,18 +95,17 @@ def test_the_verdict_warns_of_a_small_target():
     assert any("Dots surround only" in p for p in problems)
 
 
-def test_a_lens_that_changed_is_told():
+def test_a_lens_that_changed_is_told(plain):
     fitted, made = calibrated(
         two_planes(lambda p: (brown(p) - [960, 540]) * 1.003 + [960, 540], 8), model="central"
     )
-    _, earlier = calibrated(two_planes(brown, 4), model="central")
-    _, problems = verdict(gathered_evidence(fitted, made, earlier=earlier))
+    _, problems = verdict(gathered_evidence(fitted, made, earlier=plain[1]))
     assert any("The lens is not what it was" in p for p in problems)
     same = msgspec.structs.replace(made, focus_note="again")
     assert not verdict(gathered_evidence(fitted, made, earlier=same))[1]
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
-    fitted, made = calibrated(two_planes(brown, 3), model="central")
+def test_a_folder_that_is_not_there_is_named(plain, tmp_path):
+    fitted, made = plain
     with pytest.raises(StorageError, match=r"nowhere/p\.html: the report cannot be written"):
         write_calibration_report(tmp_path / "nowhere" / "p.html", fitted, made)
