@@ -76,7 +76,12 @@ class BoardCheck:
 
 
 def check_board(
-    model: CheckableRays, dots: DotObservations, *, dot_diameter_mm: float, board_um: float = 0.0
+    model: CheckableRays,
+    dots: DotObservations,
+    *,
+    dot_diameter_mm: float,
+    added_px: float = 0.0,
+    board_um: float = 0.0,
 ) -> BoardCheck:
     """Compare a picture of a board with a calibration.
 
@@ -87,6 +92,9 @@ def check_board(
         As measured.
     dot_diameter_mm : float, mm
         Of the (small) dots.
+    added_px : float, optional, px
+        Standard deviation of each of a dot's coordinates beyond the noise seen in the picture: what the
+        camera's pixels and the lens add, as the calibration found it (`ray_fit.PlaneNoise`).
     board_um : float, optional, um
         Standard deviation of each of a dot's coordinates on the board: print and flatness.
 
@@ -99,6 +107,7 @@ def check_board(
         raise CalibrationError(f"{len(dots)} dots; a check needs at least {MIN_DOTS}")
     board = np.column_stack([dots.xy_mm, np.zeros(len(dots))])
     R, t = _start(model, dots)
+    dots_px2 = dots.cov_px2 + added_px**2 * np.eye(2)
     uv = dots.uv_px
     keep = np.ones(len(dots), dtype=np.bool_)
     for _ in range(3):  # the discs' correction needs the pose, the pose the corrected dots
@@ -110,7 +119,7 @@ def check_board(
             diameter_mm=dot_diameter_mm * np.asarray(dots.size),
             axes=R[:, :2],
         )
-        W = np.asarray(np.linalg.inv(_stated_px2(model, dots.cov_px2, uv, p, R, board_um)), dtype=np.float64)
+        W = np.asarray(np.linalg.inv(_stated_px2(model, dots_px2, uv, p, R, board_um)), dtype=np.float64)
         # From the first guess of a pose some dots may lie where the rays do not reach.
         reached = keep & np.isfinite(W).all(axis=(1, 2))
         R, t, normal = _fitted_pose(model, board, uv, W, reached, R, t)

@@ -8,6 +8,9 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import CalibrationError
 
+MAX_TURN_BETWEEN_PLANES_DEG = 20.0
+"""More is a different pose of the board, not the play of a rig."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DotObservations:
@@ -92,7 +95,3 @@ def in_picture_axes(planes: Sequence[DotObservations]) -> tuple[DotObservations,
     quarter = round(float(mean) / (np.pi / 2)) % 4
     R = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarter)
     return tuple(replace(p, xy_mm=p.xy_mm @ R.T) for p in planes)
-
-
-MAX_TURN_BETWEEN_PLANES_DEG = 20.0
-"""More is a different pose of the board, not the play of a rig."""

@@ -123,6 +123,7 @@ def _checked(stored: "Calibration", job: "FitJob", *, board_um: float) -> "list[
 
     if job.mode is not None:
         require_match(stored, unit=job.unit, sensor_mode=job.mode)
+    added_px = max((noise.added_px for noise in stored.noise), default=0.0)
     pages = []
     with counting_bar("pictures", len(job.pictures)) as progress:
         for i, picture in enumerate(job.pictures):
@@ -135,6 +136,7 @@ def _checked(stored: "Calibration", job: "FitJob", *, board_um: float) -> "list[
                     stored.ray_model,
                     found.placed,
                     dot_diameter_mm=job.target.diameter_mm,
+                    added_px=added_px,
                     board_um=board_um,
                 )
             except CalibrationError as e:

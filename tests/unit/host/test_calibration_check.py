@@ -63,6 +63,7 @@ def test_wrong_rays_leave_more():
     # ... unless board or rays are stated to be as bad.
     assert check_board(StatedCamera(), dots, dot_diameter_mm=1e-3, board_um=200).ratio < 1
     assert check_board(StatedCamera(sd_mm=0.2), dots, dot_diameter_mm=1e-3).ratio < 1
+    assert check_board(StatedCamera(), dots, dot_diameter_mm=1e-3, added_px=2.0).ratio < 1
 
 
 def test_the_discs_bias_is_taken_out():

@@ -162,6 +162,26 @@ def test_the_rays_are_true_over_the_whole_picture(fitted):
         assert error_um.max() < 15.0
 
 
+@pytest.mark.skipif(
+    "BRICKTRACK_SAMPLES" not in os.environ, reason="BRICKTRACK_SAMPLES names no samples folder"
+)
+def test_pictures_of_a_larger_target_confirm_the_calibration(fitted, tmp_path):
+    """Dots that the fit has not seen, half of them where plane B's target did not reach."""
+    pictures = Path(os.environ["BRICKTRACK_SAMPLES"]) / "path-traced"
+    board = tmp_path / "54x32.toml"
+    board.write_text("[target]\ncolumns = 54\nrows = 32\npitch_mm = 4.0\ndiameter_mm = 2.0\ncoded = false\n")
+    result = CliRunner().invoke(
+        app,
+        [
+            "check", str(fitted[0]), "--board", str(board), "--origin-near", "960", "540", "--board-um", "0",
+            "--picture", f"101.117={pictures / 'calib_A_54x32.png'}",
+            "--picture", f"161.111={pictures / 'calib_B_54x32.png'}",
+        ],
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "The calibration holds" in result.output
+
+
 def test_wrong_input_is_named(tmp_path):
     rig = ("--rig", SAMPLE / "rig.toml")
     out = ("--unit", "u", "-o", tmp_path / "c.json")
