@@ -80,7 +80,7 @@ def render_combined_report(test: CombinedTest, *, links: bool = True) -> str:
     line, mood = verdict(summary)
     return page_environment().get_template("combined.html.j2").render(
         run_id=summary.name,
-        meta=_meta(summary),
+        meta=about_test(summary),
         simulated=summary.simulated,
         provenance={"software_version": summary.software_version},
         verdict=line,
@@ -106,7 +106,8 @@ def verdict(summary: TestSummary) -> tuple[str, str]:
     return f"No problem found: {said}.", "good"
 
 
-def _meta(summary: TestSummary) -> str:
+def about_test(summary: TestSummary) -> str:
+    """Return what a test is made of, in a line."""
     wave = "" if summary.nominal_hz is None else f" · square wave of {summary.nominal_hz:g} Hz"
     reference = "" if summary.reference is None else f" · samples counted by {summary.reference}"
     return f"Test of {_units(len(summary.units))}{wave}{reference} · bricktrack {summary.software_version}"
@@ -183,7 +184,7 @@ def _edges_words(unit: UnitEntry, summary: TestSummary) -> str:
 
 def _witness_words(unit: UnitEntry) -> str:
     return (
-        ", ".join(f"{w['witness']} {w['samples']:+.2f} ± {w['sd_samples']:.2f}" for w in unit.witnesses)
+        ", ".join(f"{w['witness']} {w['samples']:+z.2f} ± {w['sd_samples']:.2f}" for w in unit.witnesses)
         or "–"
     )
 
@@ -218,7 +219,7 @@ def _assembly_section(entry: AssemblyEntry, motions: dict[str, MotionHistory]) -
         ])  # fmt: skip
     if rows:
         head = ["component", "seen by", "point, mm", "peak, mm", "at sample", "peak, deg", "sd, mm",
-                "sd, deg", "of samples"]  # fmt: skip
+                "sd, deg", "measured"]  # fmt: skip
         section.tables.append(SectionTable("", head, rows, 3))
     if entry.loops:
         head = ["closed by", "rms, mm", "largest, mm", "rms, deg", "largest, deg", "over expected variance"]
