@@ -26,6 +26,7 @@ from bricktrack_common.checksums import crc32
 from bricktrack_common.errors import StorageError
 from bricktrack_common.wire_messages import RunDescription
 from bricktrack_host.durable_files import rename_durably, sync_folder, write_durably
+from bricktrack_host.transfer.unit_client import VerifiedChunk
 
 JOURNAL_NAME = ".journal.jsonl"  # begins with a dot, which no file of a run may
 JOURNAL_VERSION = 1
@@ -174,11 +175,11 @@ class PartFolder:
                 position += length
             position = max(position, end)
 
-    def write(self, name: str, offset: int, data: bytes) -> None:
-        """Write a verified chunk and note it in the journal."""
+    def write(self, name: str, chunk: VerifiedChunk) -> None:
+        """Write a chunk and note it in the journal."""
         file = self._files[name]
-        write_at(file.handle, offset, data)
-        done = _Range(file=name, offset=offset, n_bytes=len(data), crc32=crc32(data))
+        write_at(file.handle, chunk.offset, chunk.data)
+        done = _Range(file=name, offset=chunk.offset, n_bytes=len(chunk.data), crc32=chunk.crc32)
         if self._journal is not None:
             self._journal.write(msgspec.json.encode(done) + b"\n")
         file.add(done)

@@ -190,9 +190,9 @@ class _RunTransfer:
             try:
                 missing = part.missing_chunks(file.name, self.chunk_bytes)
                 while ranges := list(islice(missing, _CHUNKS_AT_ONCE)):
-                    for offset, data in client.read_chunks(self.run_id, index, ranges):
-                        part.write(file.name, offset, data)
-                        self.n_bytes_fetched += len(data)
+                    for chunk in client.read_chunks(self.run_id, index, ranges):
+                        part.write(file.name, chunk)
+                        self.n_bytes_fetched += len(chunk.data)
                         self._tell(part.n_bytes_verified)
             except TransferError as e:
                 raise TransferError(f"{self.run_id}: {file.name}: {e}") from e

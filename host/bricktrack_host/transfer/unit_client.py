@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 import zmq
 
@@ -83,6 +83,14 @@ class ClientCounts:
     """Not of this protocol."""
     repeated_chunks: int = 0
     """Asked for again, because they came broken or not at all."""
+
+
+class VerifiedChunk(NamedTuple):
+    """Bytes of a file that match their checksum."""
+
+    offset: int
+    data: bytes
+    crc32: int
 
 
 @dataclass(slots=True)
@@ -252,8 +260,8 @@ class UnitClient:
 
     def read_chunks(
         self, run_id: str, file_index: int, ranges: list[tuple[int, int]], *, credit: int = CREDIT
-    ) -> Iterator[tuple[int, bytes]]:
-        """Yield the bytes of some ranges of a file as ``(offset, bytes)``, in the order they arrive.
+    ) -> Iterator[VerifiedChunk]:
+        """Yield the bytes of some ranges of a file, in the order they arrive.
 
         Up to ``credit`` chunks are asked for ahead. A chunk that does not match its checksum, and one that
         stays out while others come, is asked for again.
@@ -293,7 +301,7 @@ class UnitClient:
             if problem:
                 self._ask_again(chunk, waiting, problem)
             else:
-                yield chunk.offset, data
+                yield VerifiedChunk(chunk.offset, data, header.crc32)
                 heard_s = time.monotonic()  # a slow disk on this side is not the unit's silence
             for overdue in [i for i in asked if i < request_id - 2 * credit]:
                 lost = asked.pop(overdue)

@@ -4,12 +4,14 @@ import hashlib
 import json
 import os
 import random
+import zlib
 
 import pytest
 
 from bricktrack_common.wire_messages import FileSummary, RunDescription
 from bricktrack_host.transfer import part_folder
 from bricktrack_host.transfer.part_folder import JOURNAL_NAME, PartFolder
+from bricktrack_host.transfer.unit_client import VerifiedChunk
 
 DATA = random.Random(2).randbytes(1_000_003)
 CHUNK = 64 * 1024
@@ -32,7 +34,8 @@ def fail(text):
 
 def fill(part, chunks):
     for offset, n_bytes in chunks:
-        part.write("video.h264", offset, DATA[offset : offset + n_bytes])
+        data = DATA[offset : offset + n_bytes]
+        part.write("video.h264", VerifiedChunk(offset, data, zlib.crc32(data)))
 
 
 @pytest.mark.parametrize("hash_bytes", [1, 200_000, 10**9])

@@ -35,7 +35,7 @@ def runs(tmp_path):
 def whole_file(client, *, chunk_bytes=1000, n_bytes=100_000):
     ranges = [(o, min(chunk_bytes, n_bytes - o)) for o in range(0, n_bytes, chunk_bytes)]
     out = bytearray(n_bytes)
-    for offset, data in client.read_chunks(RUN, 1, ranges):
+    for offset, data, _ in client.read_chunks(RUN, 1, ranges):
         out[offset : offset + len(data)] = data
     return bytes(out)
 
