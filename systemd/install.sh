@@ -94,7 +94,7 @@ fi
 if [ "$make_venv" = yes ]; then
     # picamera2, libcamera and numpy must be the system's own: they are built for each other.
     [ -x "$venv/bin/python" ] || python3 -m venv --system-site-packages "$venv"
-    "$venv/bin/python" -m pip install --quiet --upgrade "bricktrack[device] @ file://$(realpath "$source")"
+    "$venv/bin/python" -m pip install --quiet --upgrade "bricktrack[device,discovery] @ file://$(realpath "$source")"
     "$venv/bin/bricktrackd" --help > /dev/null
 fi
 
