@@ -209,7 +209,10 @@ def test_usage_errors_exit_with_2():
     assert invoke("pull", "--nonsense").exit_code == 2
 
 
-@pytest.mark.parametrize("command", ["status", "arm", "disarm", "pull", "import", "calibrate"])
+@pytest.mark.parametrize(
+    "command",
+    ["find", "status", "still", "configure", "arm", "disarm", "pull", "delete", "import", "calibrate"],
+)
 def test_every_command_has_help_with_an_example(command):
     result = invoke(command, "--help")
     assert result.exit_code == 0

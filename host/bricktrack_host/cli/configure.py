@@ -44,8 +44,11 @@ def configure(
 ) -> None:
     """Show or change how units are configured; changes survive their restarts.
 
-    A unit takes all values or none, and only while it is idle. Values are written as in a TOML file; a word
-    needs no quotes. Exits with 1 if a unit did not take them, and says which.
+    A unit takes all values or none, and only while it is idle.
+
+    Values are written as in a TOML file; a word needs no quotes.
+
+    Exits with 1 if a unit did not take them, and says which.
 
     For example:
 

@@ -57,8 +57,9 @@ def delete(
 ) -> None:
     """Delete runs from the units' cards.
 
-    A run goes only once a host holds it, verified, unless --force says otherwise. Says what would go and asks
-    before it does anything. Exits with 1 if a run was not deleted.
+    A run goes only once a host holds it, verified, unless --force says otherwise.
+
+    Says what would go and asks before it does anything. Exits with 1 if a run was not deleted.
 
     For example:
 

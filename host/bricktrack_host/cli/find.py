@@ -23,7 +23,9 @@ def find(
 ) -> None:
     """Show the units that announce themselves in this network, and what the fleet file says of each.
 
-    A unit that is bound to its own loopback address announces nothing. Exits with 1 if none is found.
+    A unit that is bound to its own loopback address announces nothing.
+
+    Exits with 1 if none is found.
 
     For example:
 

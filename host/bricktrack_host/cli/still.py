@@ -60,9 +60,11 @@ def still(
 ) -> None:
     """Take a picture with each unit, mark the LEDs that are found, and say how sharp they are.
 
-    Saves NAME.png as the camera saw it and NAME_leds.png with the marks. The focus is the width of the LEDs'
-    edges in pixels: the smaller, the sharper. Exits with 1 if a picture did not come, or shows another number
-    of LEDs than the unit's layout file has.
+    Saves NAME.png as the camera saw it and NAME_leds.png with the marks.
+
+    The focus is the width of the LEDs' edges in pixels: the smaller, the sharper.
+
+    Exits with 1 if a picture did not come, or shows another number of LEDs than the layout file has.
 
     For example:
 
