@@ -17,6 +17,8 @@ from bricktrack_host.calibration.capture_file import load_capture
 from bricktrack_host.calibration.printed_target import DotTarget, target_toml
 from bricktrack_host.cli import app
 
+pytestmark = pytest.mark.slow  # some 20 s together, drawing included
+
 TARGET = DotTarget(columns=48, rows=30, pitch_mm=4.0, diameter_mm=2.0)
 CAMERA = camera_of()
 MODE = """name = "full"
