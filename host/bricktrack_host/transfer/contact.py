@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
-from bricktrack_common.errors import BricktrackError, ConfigError, UnitTimeoutError
+from bricktrack_common.errors import BricktrackError, ConfigError, UnitError, UnitTimeoutError
 from bricktrack_common.key_files import KeyPair
 from bricktrack_common.wire_messages import HelloReply
 from bricktrack_host.transfer.fleet_config import UnitConfig, check_name, is_loopback
@@ -74,8 +74,9 @@ class Dialer:
         with ExitStack() as opened:
             try:
                 contact = self._try(unit, unit.address, opened) if unit.address else None
-            except UnitTimeoutError:
-                moved = self._find(unit)
+            except (UnitTimeoutError, ConfigError, UnitError) as e:
+                # Nobody is there, or another unit: addresses that are handed out go round.
+                moved = None if isinstance(e, UnitError) and e.code != "not-allowed" else self._find(unit)
                 if moved is None or moved == unit.address:
                     raise
                 logger.warning("%s: not at %s any more; found at %s", unit.name, unit.address, moved)

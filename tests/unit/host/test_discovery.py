@@ -9,7 +9,7 @@ from run_folders import contents, make_run
 from bricktrack_common.discovery import SERVICE_TYPE, Announcement
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.key_files import fingerprint, make_key_pair
-from bricktrack_host.transfer.contact import Dialer
+from bricktrack_host.transfer.contact import Dialer, ask_units
 from bricktrack_host.transfer.discovery import NetworkFinder
 from bricktrack_host.transfer.fleet_config import UnitConfig
 from bricktrack_host.transfer.pull import pull_unit
@@ -110,6 +110,28 @@ def test_a_unit_that_moved_is_found_and_its_run_comes(tmp_path):
     assert contents(tmp_path / "more" / "fake_0001") == contents(source)
     assert (result.errors, nameless.errors) == ([], [])
     assert "calls itself 'fake'; the fleet file calls it 'b7'" in str(other.errors[0])
+
+
+class Register:
+    """A finder that knows where each unit is."""
+
+    def __init__(self, units):
+        self.addresses = {unit.name: unit.address for unit in units}
+
+    def find(self, unit):
+        return self.addresses.get(unit.name)
+
+
+def test_units_that_changed_places_are_told_apart(tmp_path):
+    """Addresses that are handed out go round: each unit is where the other was."""
+    for name in ("b1", "b2"):
+        make_run(tmp_path / name, f"{name}_0001", {"video.h264": 1000}, unit=name)
+    with FakeUnit(tmp_path / "b1", name="b1") as b1, FakeUnit(tmp_path / "b2", name="b2") as b2:
+        swapped = [UnitConfig(name="b1", address=b2.address), UnitConfig(name="b2", address=b1.address)]
+        dialer = Dialer(timeout_s=1.0, finder=Register([b1, b2]))
+        names = ask_units(swapped, lambda c: c.client.status().unit, dialer=dialer)
+        assert [type(r).__name__ for r in b1.requests].count("GetStatus") == 1
+    assert names == ["b1", "b2"]
 
 
 def test_a_unit_without_an_address_that_nobody_finds_is_said(tmp_path):
