@@ -16,7 +16,7 @@ from bricktrack_common.errors import TrackingError
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.hit_polynomials import HitPolynomials, expand_at, hit_polynomials
 from bricktrack_host.tracking.led_profile import shift_per_radius
-from bricktrack_host.tracking.refine_kernel import Fitted, Model, Observed, fit_frames
+from bricktrack_host.tracking.refine_kernel import N_MORE, Fitted, Model, Observed, fit_frames
 
 HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
@@ -41,8 +41,8 @@ class LedMotion:
     dt_s : ndarray, shape (n, n_leds), s
         From the frame's instant to the LED's.
     twist_sd : ndarray, shape (n, 6), rad/s and mm/s, or None
-        How well that motion is known, as a twist: the frame's own rows then correct it, as far as they can.
-        `None`: it is taken as given.
+        How well that motion is known, as a twist, and with it the twist's rate: the frame's own rows then
+        correct both, as far as they can. `None`: the motion is taken as given.
     """
 
     rvec_brick_rad: FloatArray
@@ -212,7 +212,7 @@ def _fitted(R: FloatArray, t_mm: FloatArray, n_leds: int) -> Fitted:
     return Fitted(
         R=np.array(R, order="C"),
         t=np.array(t_mm, order="C"),
-        more=np.zeros((n, 7)),
+        more=np.zeros((n, N_MORE)),
         covariance=np.empty((n, 6, 6)),
         residual=np.full((n, n_leds, 2), np.nan),
         sigmas=np.full((n, n_leds), np.nan),

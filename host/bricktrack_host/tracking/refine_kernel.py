@@ -1,7 +1,7 @@
 """Compiled: the least-squares fit of one frame's pose after the other; see `refine` for what it fits.
 
 Unknowns are ``[turn of the brick, rad; shift, mm]`` and, where asked for, the profile's one unknown, common
-to all LEDs, and a change of the twist that the LEDs' motion was had from, in this order.
+to all LEDs, a change of the twist that the LEDs' motion was had from, and of its rate, in this order.
 """
 
 import math
@@ -13,9 +13,14 @@ from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_host.compiled import compiled
 from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view
 
-N_UNKNOWNS = 13
-_PROFILE, _TWIST = 6, 7
+N_UNKNOWNS = 19
+_PROFILE, _TWIST, _RATE = 6, 7, 13
+N_MORE = N_UNKNOWNS - 6
 _FRESH_MM, _FRESH_RAD = 1.0, 0.05  # moved less than this, an LED's shape is good to 0.001 px
+_RATE_PER_TWIST = 30.0
+"""How wrong the twist's rate may be for a given doubt about the twist, 1/s. Of a sine of w T = 0.6 to pi (3
+to 15 Hz at 30 frames a second), a cubic spline's second derivative at the frames errs by 0.09 to 0.15 of the
+fourth difference over T^2, while the twist is doubted by 0.1 of it over T (`optical_track`)."""
 _DONE_SIGMAS = 1e-3  # a last step this small, and the next smaller still, is far below the pose's own error
 
 
@@ -117,7 +122,7 @@ def _room(n_leds: int) -> _Room:
         np.empty(k),
         np.empty((3, 3)),
         np.empty(3),
-        np.empty(7),
+        np.empty(N_MORE),
         np.empty((3, 3)),
         np.empty((3, 3)),
         np.empty(3),
@@ -137,7 +142,7 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
     The LEDs' shapes are those of the start; where the pose went far from it, they are had anew.
     """
     R, t, more = fitted.R[i], fitted.t[i], fitted.more[i]
-    n = _TWIST + 6 if observed.has_twist else _PROFILE + 1 if model.profile_sd > 0 else _PROFILE
+    n = N_UNKNOWNS if observed.has_twist else _PROFILE + 1 if model.profile_sd > 0 else _PROFILE
     cost, rejected = 0.0, False
     for round_ in range(3):
         _copy(R, t, more, room.R_shape, room.t_shape, room.more)
@@ -215,10 +220,11 @@ def _place(
 ) -> None:
     """Find an LED's centre and axis, camera frame, at its own instant, with R_led = R E."""
     if has_motion:
+        by_twist, by_rate = dt[i, k], 0.5 * dt[i, k] ** 2
         rotation(
-            rvec[i, k, 0] + more[1] * dt[i, k],
-            rvec[i, k, 1] + more[2] * dt[i, k],
-            rvec[i, k, 2] + more[3] * dt[i, k],
+            rvec[i, k, 0] + more[1] * by_twist + more[7] * by_rate,
+            rvec[i, k, 1] + more[2] * by_twist + more[8] * by_rate,
+            rvec[i, k, 2] + more[3] * by_twist + more[9] * by_rate,
             E,
         )
         for r in range(3):
@@ -232,7 +238,7 @@ def _place(
         centre[r] = R_led[r, 0] * P[k, 0] + R_led[r, 1] * P[k, 1] + R_led[r, 2] * P[k, 2] + t[r]
         axis[r] = R_led[r, 0] * N[k, 0] + R_led[r, 1] * N[k, 1] + R_led[r, 2] * N[k, 2]
         if has_motion:
-            centre[r] += shift[i, k, r] + more[4 + r] * dt[i, k]
+            centre[r] += shift[i, k, r] + (more[4 + r] + more[10 + r] * 0.5 * dt[i, k]) * dt[i, k]
 
 
 @compiled
@@ -270,7 +276,7 @@ def _normal_equations(
     J, J_centre, J_axis = room.J, room.J_centre, room.J_axis
     residual, sigmas_out, area, facing_out = fitted.residual, fitted.sigmas, fitted.area, fitted.facing
     has_profile = model.profile_sd > 0
-    n = _TWIST + 6 if has_twist else _PROFILE + 1 if has_profile else _PROFILE
+    n = N_UNKNOWNS if has_twist else _PROFILE + 1 if has_profile else _PROFILE
     for c in range(n):
         g[c] = 0.0
         J[0, c], J[1, c] = 0.0, 0.0
@@ -321,12 +327,12 @@ def _normal_equations(
         cost += more[0] ** 2 * per_sd
     elif n > _PROFILE:
         A[_PROFILE, _PROFILE] = 1.0  # held where it is
-    if observed.has_twist:
-        for c in range(6):
-            per_sd = 1 / observed.twist_sd[i, c] ** 2
-            A[_TWIST + c, _TWIST + c] += per_sd
-            g[_TWIST + c] -= more[1 + c] * per_sd
-            cost += more[1 + c] ** 2 * per_sd
+    if has_twist:
+        for c in range(12):
+            sd = observed.twist_sd[i, c % 6] * (_RATE_PER_TWIST if c >= 6 else 1.0)
+            A[_TWIST + c, _TWIST + c] += 1 / sd**2
+            g[_TWIST + c] -= more[1 + c] / sd**2
+            cost += (more[1 + c] / sd) ** 2
     return cost
 
 
@@ -364,8 +370,10 @@ def _pose_row(
     t2 = P[k, 0] * y - P[k, 1] * x + N[k, 0] * q - N[k, 1] * p
     J[row, 3], J[row, 4], J[row, 5] = c0, c1, c2
     if has_twist:
-        J[row, 7], J[row, 8], J[row, 9] = t0 * dt, t1 * dt, t2 * dt
-        J[row, 10], J[row, 11], J[row, 12] = c0 * dt, c1 * dt, c2 * dt
+        for order in range(2):
+            share, at = (dt, _TWIST) if order == 0 else (0.5 * dt * dt, _RATE)
+            J[row, at], J[row, at + 1], J[row, at + 2] = t0 * share, t1 * share, t2 * share
+            J[row, at + 3], J[row, at + 4], J[row, at + 5] = c0 * share, c1 * share, c2 * share
     if has_motion:  # R_led = R E: a turn theta of the frame's brick is E' theta of the LED's
         J[row, 0] = E[0, 0] * t0 + E[0, 1] * t1 + E[0, 2] * t2
         J[row, 1] = E[1, 0] * t0 + E[1, 1] * t1 + E[1, 2] * t2
@@ -401,7 +409,7 @@ def _copy(
         t_to[r] = t[r]
         for c in range(3):
             R_to[r, c] = R[r, c]
-    for c in range(7):
+    for c in range(N_MORE):
         more_to[c] = more[c]
 
 
@@ -413,7 +421,7 @@ def _move(R: FloatArray, t: FloatArray, more: FloatArray, step: FloatArray, E: F
         for c in range(3):
             R[r, c] = x * E[0, c] + y * E[1, c] + z * E[2, c]
         t[r] += step[3 + r]
-    for c in range(7):
+    for c in range(N_MORE):
         more[c] += step[6 + c]
 
 

@@ -181,3 +181,19 @@ def test_a_frame_corrects_the_twist_that_it_was_given_as_far_as_its_rows_tell():
     # The depth's covariance says what that costs beside a motion that is known.
     known = fitted(LedMotion(rvec, shift, dt))
     assert (free.covariance[:, 5, 5] > 2 * known.covariance[:, 5, 5]).all()
+
+
+def test_a_brick_that_turns_back_within_the_frame_is_within_its_covariance():
+    brick = seven_leds(collar_mm=0.7)
+    R, t = random_poses(6, seed=13)
+    dt = (CAMERA.project(leds_in_camera(R, t, brick)).uv_px[..., 1] - 539.5) * 18.9035e-6
+    shift = 0.5 * np.array([6000.0, 2000.0, -3000.0]) * dt[..., None] ** 2  # mm/s^2: 0.05 m/s within 8 ms
+    uv = np.stack([dome_centroids(R, t + shift[:, k], brick, 0.7)[:, k] for k in range(7)], axis=1)
+    nothing = np.zeros((6, 7, 3))
+    sd = np.tile([1.0, 1.0, 1.0, 150.0, 150.0, 150.0], (6, 1))
+    poses = refine_poses(
+        uv, cov(6, sd=0.02), R, t, CAMERA, brick, collar_mm=0.7, motion=LedMotion(nothing, nothing, dt, sd)
+    )
+    error = error_of(poses.R_camera_brick, poses.t_camera_brick_mm, R, t)
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariance), error)
+    assert nees.max() < 16.8  # the 1 % point of chi-square with 6
