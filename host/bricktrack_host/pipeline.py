@@ -32,6 +32,7 @@ from bricktrack_host.calibration.calibration_file import (
 )
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
+from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.recordings.video_frames import decode_run_video
@@ -202,7 +203,8 @@ def process_run(
             optical = _retime(observations, first, optical, imu, alignment, rays.ray_model, brick)
             _require_poses(optical, run, brick)
         grid = _output_grid(optical, imu, alignment, edge_fit)
-        fused, fusion = _fuse(optical, imu, alignment, brick, grid, problems)
+        seen = (observations, rays.ray_model) if settings.rolling_shutter else None
+        fused, fusion = _fuse(optical, imu, alignment, brick, grid, problems, seen=seen)
     result = RunResult(
         manifest=run.manifest,
         led_names=brick.led_names,
@@ -471,14 +473,23 @@ def _fuse(
     brick: BrickModel,
     grid: _Grid,
     problems: list[str],
+    *,
+    seen: tuple[LedObservations, RayModel] | None,
 ) -> tuple[dict[FusedKind, FusedTrack], FusionResult | None]:
+    """Return the motion at the instants wanted: LED by LED where ``seen`` is given, else pose by pose."""
     wanted = np.concatenate(list(grid.t_ns.values()))
     fusion = None
     if imu is not None and alignment is not None and brick.imu_lever_arm_mm is not None:
         try:
-            fusion = fuse(
-                optical, imu, lever_arm_mm=brick.imu_lever_arm_mm, output_t_ns=wanted, alignment=alignment
-            )
+            if seen is None:
+                fusion = fuse(
+                    optical, imu, lever_arm_mm=brick.imu_lever_arm_mm, output_t_ns=wanted, alignment=alignment
+                )
+            else:
+                lever_arm_mm = brick.imu_lever_arm_mm
+                fusion = _fuse_tight(
+                    optical, imu, alignment, brick, seen, wanted, problems, lever_arm_mm=lever_arm_mm
+                )
         except (ShapeError, TrackingError) as e:
             problems.append(f"fusion was not possible, optical poses alone: {e}")
     if fusion is not None:
@@ -496,6 +507,33 @@ def _fuse(
         for (kind, t), end in zip(grid.t_ns.items(), ends.tolist(), strict=True)
     }
     return parts, fusion
+
+
+def _fuse_tight(
+    optical: OpticalTrack,
+    imu: ImuTrack,
+    alignment: TimeAlignment,
+    brick: BrickModel,
+    seen: tuple[LedObservations, RayModel],
+    wanted: IntArray,
+    problems: list[str],
+    *,
+    lever_arm_mm: FloatArray,
+) -> FusionResult:
+    observations, rays = seen
+    tight = fuse_tight(
+        observations, optical, imu, rays, brick,
+        lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=alignment,
+    )  # fmt: skip
+    n_rejected = int(np.count_nonzero(tight.led_rejected))
+    if n_rejected:
+        problems.append(f"{n_rejected} LED centroids disagree with all the others and were left out")
+    if not tight.check.agrees:
+        problems.append(
+            f"fusion LED by LED and pose by pose are up to {tight.check.max_mm:.2f} mm apart, in "
+            f"{100 * tight.check.share_apart:.0f} % of the instants by more than their uncertainty allows"
+        )
+    return tight.fused
 
 
 def _rows(track: FusedTrack, rows: slice) -> FusedTrack:

@@ -102,9 +102,7 @@ class SawToothSearch:
         half = len(self._read_s) // 2
         slot = np.arange(len(self._read_s))
         by_row_s = float(np.median(self._read_s[half : 2 * half] - self._read_s[:half])) / half
-        if (
-            abs(by_row_s / signal.period_s - 1) > _MAX_RATE_ERROR
-        ):  # rows are left out: there is not one a slot
+        if abs(by_row_s / signal.period_s - 1) > _MAX_RATE_ERROR:  # not every slot has a row
             step = np.round(np.diff(self._read_s) / signal.period_s)
             slot = np.concatenate([[0], np.cumsum(step)]).astype(np.int64)
         far = slot[half:] - slot[: len(slot) - half]

@@ -31,6 +31,7 @@ logger = logging.getLogger(__name__)
 
 _PASSES = 3
 _GATE_CHI2 = 20.7  # of 2 degrees of freedom; passed by all but one in 30 000
+_SCALE_STANDS = 1.05
 _CHI_2_MEDIAN = 1.386  # median of chi-square with 2 degrees of freedom
 _DISAGREE_CHI2 = 22.5  # of 6 degrees of freedom: one in 1000
 _DISAGREE_SHARE = 0.02
@@ -193,9 +194,12 @@ def _smooth_leds(
         now = replace(
             first, run=run, nodes=nodes, lin=lin, problem=problem, passed=passed, estimate=estimate, b=0
         )
-        if i < _PASSES - 1:
-            more = max(float(np.sqrt(np.median(chi2[use]) / _CHI_2_MEDIAN)), 1.0 / scale)
-            scale, use = scale * more, (chi2 < _GATE_CHI2 * more**2) & pictured.is_facing
+        more = max(float(np.sqrt(np.median(chi2[use]) / _CHI_2_MEDIAN)), 1.0 / scale)
+        good = (chi2 < _GATE_CHI2 * more**2) & pictured.is_facing
+        is_settled = i > 0 and more < _SCALE_STANDS and np.array_equal(good, use)
+        if is_settled or i == _PASSES - 1:
+            break
+        scale, use = scale * more, good
     return leds, now, chi2, use, scale
 
 
