@@ -15,11 +15,14 @@ import msgpack
 import numpy as np
 import pytest
 from fake_unit import FakeUnit
+from light_fleet import LightFleet, write_fleet_file
 from light_unit import LightUnit, make_keys
 from run_folders import contents, make_run
 from typer.testing import CliRunner
 
+from bricktrack_common.checksums import sha256_file
 from bricktrack_common.key_files import make_key_pair, write_secret_key
+from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_common.wire_messages import Arm, DeleteRun, Refusal, encode_message
 from bricktrack_host.cli import app
 
@@ -332,3 +335,32 @@ def test_a_unit_that_is_asked_too_often_is_given_time(card):
         result = invoke("delete", "--confirmed", "--yes", "-a", unit.address)
     assert result.exit_code == 0, result.stderr
     assert list(card.iterdir()) == []
+
+
+def test_a_fleet_is_armed_triggered_and_pulled_and_a_second_host_is_refused_meanwhile(tmp_path):
+    """Light units (simulated) with the real server and run store; scripts/bench_fleet.py does it with 400."""
+    names = [f"u-{i:02d}" for i in range(30)]
+    with LightFleet(tmp_path / "cards", names, n_processes=2) as fleet:
+        file = write_fleet_file(tmp_path / "fleet.toml", {n: fleet.ports[n] for n in names})
+        armed = invoke("arm", "--fleet", file, "--label", "x")
+        second = invoke("arm", "--fleet", file, "--unit", "u-03", "--json")
+        busy = invoke("pull", "--fleet", file, "-o", tmp_path / "runs")
+        fleet.trigger(300_000)
+        pulled = json.loads(invoke("pull", "--fleet", file, "-o", tmp_path / "runs", "--json").stdout)
+        deleted = invoke("delete", "--confirmed", "--yes", "--fleet", file)
+    assert armed.exit_code == 0, armed.stderr
+    assert "30 of 30 units armed" in armed.stdout
+    assert json.loads(second.stdout)["units"][0]["code"] == "wrong-state"
+    assert busy.exit_code == 0  # nothing to fetch yet: nothing to complain of
+    assert (len(pulled["runs"]), pulled["errors"]) == (30, [])
+    assert "30 of 30 runs deleted" in deleted.stdout
+    assert list((tmp_path / "cards").glob("*/runs/*")) == []
+    verified = [unit_and_hashes(Path(run["folder"])) for run in pulled["runs"]]
+    assert sorted(unit for unit, _ in verified) == names
+    assert all(good for _, good in verified)
+
+
+def unit_and_hashes(folder):
+    """Return a run's unit, and whether its files have the hashes that its manifest says."""
+    manifest = read_manifest(folder / MANIFEST_NAME)
+    return manifest.unit, all(sha256_file(folder / f.name) == f.sha256 for f in manifest.files)

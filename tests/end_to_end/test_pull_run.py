@@ -389,7 +389,9 @@ def test_several_units_come_side_by_side_and_one_that_fails_does_not_stop_the_re
     units = [FakeUnit(tmp_path / f"card{i}") for i in range(3)]
     with units[0], units[1], units[2]:
         notes = Notes()
-        results = pull_fleet([unit_at(u.address) for u in units], here, progress=notes, dialer=Dialer(timeout_s=0.5))
+        results = pull_fleet(
+            [unit_at(u.address) for u in units], here, progress=notes, dialer=Dialer(timeout_s=0.5)
+        )
     assert sorted(p.name for p in here.iterdir() if p.name in {f"u{i}_000{j}" for i in range(3) for j in (1, 2)}) == [
         "u0_0001", "u0_0002", "u1_0002", "u2_0001", "u2_0002",
     ]  # fmt: skip
