@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bricktrack_common.brick_model import load_brick_model
 from bricktrack_common.camera_model import SensorMode
-from bricktrack_common.errors import ConfigError
+from bricktrack_common.errors import CalibrationError, ConfigError
 from bricktrack_host.calibration.calibration_file import (
     Target,
     TargetImage,
@@ -90,7 +90,10 @@ def run_fit(
     earlier = load_calibration(options.earlier) if options.earlier is not None else None
     brick = load_brick_model(options.layout) if options.layout is not None else None
     if earlier is not None:
-        require_match(earlier, unit=unit, sensor_mode=mode)
+        try:
+            require_match(earlier, unit=unit, sensor_mode=mode)
+        except CalibrationError as e:
+            raise CalibrationError(f"{options.earlier}: cannot be compared with these pictures: {e}") from e
     pictures = observe_job(job, mode)
     planes = [(z_mm, merged.dots) for z_mm, merged in merged_planes(pictures)]
     with err.status("fit") as status:
