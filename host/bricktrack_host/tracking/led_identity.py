@@ -99,6 +99,7 @@ class _Run:
         self._radius_px, self._gate_px = radius_px, identity_gate_px(radius_px)
         self._collar_mm, self._method = collar_mm, method
         self._searched = np.zeros(n, dtype=bool)
+        self._doubted = np.zeros(n, dtype=bool)
         self.result = Identities(
             blob_of_led=np.full((n, self._n_leds), -1, dtype=np.int64),
             R_camera_brick=np.full((n, 3, 3), np.nan),
@@ -111,6 +112,8 @@ class _Run:
         blobs = self._blobs[i]
         if blobs is None or len(blobs) < MIN_INLIERS or self._searched[i]:
             return False
+        if self._doubted[i]:
+            return True
         # Two more good lights than identified LEDs: the pattern may hold on to the wrong ones.
         wanted = min(int((blobs.flags == 0).sum()), self._n_leds) - 2
         return int((self.result.blob_of_led[i] >= 0).sum()) < max(wanted, MIN_INLIERS)
@@ -140,6 +143,13 @@ class _Run:
         proposals += self._propose(anchor, range(anchor - 1, -1, -1))
         if not proposals:
             return
+        for i, assigned_blobs in proposals:
+            # The pattern needs cut lights though others would do: it may hold on to the wrong ones.
+            cut, blobs = self._cut_lights(i, assigned_blobs), self._blobs[i]
+            n_whole = int(((assigned_blobs >= 0) & ~cut).sum())
+            n_others = 0 if blobs is None else int((blobs.flags == 0).sum())
+            self._doubted[i] = cut.any() and n_whole < MIN_INLIERS < n_others
+        proposals = [(i, self._whole_lights(i, a)) for i, a in proposals]
         frames = np.array([i for i, _ in proposals])
         assigned = np.array([a for _, a in proposals])
         uv = np.stack([_pixels(self._blobs[i], a) for i, a in proposals])
@@ -167,6 +177,24 @@ class _Run:
         self.result.t_camera_brick_mm[at] = poses.t_camera_brick_mm[better]
         self.result.is_ambiguous[at] = False
         self._complete(at)
+
+    def _cut_lights(self, i: int, assigned: IntArray) -> BoolArray:
+        """Tell which LEDs were given a light that the border or a card cuts, or that is two."""
+        blobs = self._blobs[i]
+        return (
+            np.zeros(len(assigned), dtype=bool)
+            if blobs is None
+            else (assigned >= 0) & (blobs.flags[assigned] != 0)
+        )
+
+    def _whole_lights(self, i: int, assigned: IntArray) -> IntArray:
+        """Leave cut lights out while five others remain: they pull the pose.
+
+        What is left of an LED has its centroid elsewhere, up to a radius; a pose from it would lose LEDs that
+        are whole. `_complete` gives it back where the pose of the others sees it.
+        """
+        cut = self._cut_lights(i, assigned)
+        return np.where(cut, -1, assigned) if int(((assigned >= 0) & ~cut).sum()) > MIN_INLIERS else assigned
 
     def _complete(self, frames: IntArray) -> None:
         """Give LEDs that the pattern missed the free blob where the verified pose sees them."""
@@ -197,8 +225,9 @@ class _Run:
         for row, (i, assigned) in enumerate(proposals):
             if kept[row].sum() > (self.result.blob_of_led[i] >= 0).sum():
                 self.result.blob_of_led[i] = np.where(kept[row], assigned, -1)
-                self.result.R_camera_brick[i] = poses.R_camera_brick[row]
-                self.result.t_camera_brick_mm[i] = poses.t_camera_brick_mm[row]
+                if (self._whole_lights(i, assigned) == assigned).all():  # else that of the whole ones stays
+                    self.result.R_camera_brick[i] = poses.R_camera_brick[row]
+                    self.result.t_camera_brick_mm[i] = poses.t_camera_brick_mm[row]
 
     def _verify(
         self, uv: FloatArray, starts: tuple[FloatArray, FloatArray]
