@@ -111,7 +111,7 @@ def boards(*, coded: bool) -> int:
     print(f"  dots placed: {n_placed / n_whole:.1%} of those wholly in view, not hidden")
     print(
         f"  centres: median error {np.median(off):.3f} px, 95 % below {np.percentile(off, 95):.3f}, 99.9 % below "
-        f"{np.percentile(off, 99.9):.2f}; median of error by stated sd {np.median(ratio):.2f} (1.18 expected; drawing with nine samples a pixel adds some 0.01 px)"
+        f"{np.percentile(off, 99.9):.2f}; median of error by stated sd {np.median(ratio):.2f} (1.18 expected; drawing with nine samples a pixel adds 0.014 px)"
     )
     print(f"  OpenCV findCirclesGrid, told 40 x 26: found {peer_found} of {N_BOARDS}")
     print(f"  wall time: {took:.1f} s, OpenCV {peer_took:.1f} s (ratio {took / peer_took:.2f})")
