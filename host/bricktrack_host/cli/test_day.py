@@ -9,7 +9,8 @@ from rich.table import Table
 
 from bricktrack_common.errors import BricktrackError, ConfigError
 from bricktrack_common.run_manifest import MANIFEST_NAME
-from bricktrack_common.wire_messages import Armed, StatusReply
+from bricktrack_common.wire_messages import Armed
+from bricktrack_host.campaign.readiness import obstacles
 from bricktrack_host.campaign.test_plan import (
     COMBINED_FOLDER,
     PlannedTest,
@@ -255,7 +256,7 @@ def _look(chosen: ChosenUnits, name: str) -> None:
         table.add_column(header)
     n_ready = 0
     for unit, answer in zip(chosen.units, answers, strict=True):
-        reasons = [(str(answer), "")] if isinstance(answer, BricktrackError) else _obstacles(answer, name)
+        reasons = [(str(answer), "")] if isinstance(answer, BricktrackError) else obstacles(answer, name)
         n_ready += not reasons
         for words, remedy in reasons:
             table.add_row(unit.name, "[red]no[/]", words.replace("[", r"\["), remedy.replace("[", r"\["))
@@ -265,16 +266,3 @@ def _look(chosen: ChosenUnits, name: str) -> None:
     if n_ready < len(chosen.units):
         raise typer.Exit(EXIT_ERROR)
     out.print(f"next: bricktrack test arm {name}", markup=False)
-
-
-def _obstacles(now: StatusReply, name: str) -> list[tuple[str, str]]:
-    """Return what keeps a unit from recording well, each with its remedy."""
-    found = [(f"{item.name}: {item.words}", item.remedy) for item in now.health if item.level == "fail"]
-    if now.state == "fault":
-        found.append((now.reason or now.last_error or "in fault", "'bricktrack disarm' clears it"))
-    elif now.state != "idle" and not is_of_test(now.run_id, name):
-        found.append((f"{now.state} for {now.run_id}", "Wait, or 'bricktrack disarm'"))
-    if now.disk_free_bytes < now.disk_needed_bytes:
-        free, needed = now.disk_free_bytes / 1e9, now.disk_needed_bytes / 1e9
-        found.append((f"{free:.1f} GB free; a run needs {needed:.1f} GB", "Pull its runs, then delete them"))
-    return found

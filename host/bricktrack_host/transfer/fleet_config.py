@@ -1,6 +1,7 @@
 """``fleet.toml``: which units there are, where they are reached, and what belongs to each."""
 
 import ipaddress
+import math
 import re
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -36,6 +37,8 @@ class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         The camera's calibration and the brick's LED layout; ``""`` if not given.
     camera : "static", "imu" or "table"
         What the camera moves with: nothing, a component with its own IMU, or the shaking table.
+    position_mm : (float, float), mm, optional
+        Where it stands in the array's plan, x to the right and y up; only drawings need it.
     """
 
     name: Annotated[str, msgspec.Meta(pattern=RUN_ID_PATTERN)]
@@ -44,6 +47,7 @@ class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     calibration: str = ""
     layout: str = ""
     camera: CameraMount = "static"
+    position_mm: tuple[float, float] | None = None
 
     @property
     def calibration_path(self) -> Path | None:
@@ -123,6 +127,8 @@ def load_fleet(path: Path) -> Fleet:
         where = f"{path}: unit[{i}]"
         if unit.address:
             check_address(unit.address, where=f"{where}.address")
+        if unit.position_mm is not None and not all(math.isfinite(x) for x in unit.position_mm):
+            raise ConfigError(f"{where}.position_mm: expected two finite numbers, got {unit.position_mm}")
         for key, values in seen.items():
             value = getattr(unit, key)
             if value and value in values:

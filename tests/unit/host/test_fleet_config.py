@@ -37,6 +37,13 @@ def test_paths_are_relative_to_the_file(tmp_path):
     assert [u.camera for u in fleet.unit] == ["static", "imu"]
 
 
+def test_a_place_in_the_plan_is_two_finite_numbers(tmp_path):
+    placed = GOOD.replace('camera = "imu"', "position_mm = [1200.0, 400.0]")
+    assert [u.position_mm for u in load(tmp_path, placed).unit] == [None, (1200.0, 400.0)]
+    with pytest.raises(ConfigError, match=r"unit\[1\].position_mm: expected two finite"):
+        load(tmp_path, placed.replace("400.0", "nan"))
+
+
 def test_units_are_chosen_by_name(tmp_path):
     fleet = load(tmp_path, GOOD)
     assert [u.name for u in fleet.select(["b2"])] == ["b2"]
