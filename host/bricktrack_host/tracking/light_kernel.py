@@ -136,10 +136,12 @@ def measure_window(
     cut = np.uint8(np.searchsorted(share, SEARCH_SHARE))
     height, width = v1 - v0, u1 - u0
     mask = np.empty((height, width), dtype=np.uint8)
+    n_lit = 0
     for j in range(height):
         row = (v0 + j) * stride + u0
         for i in range(width):
             mask[j, i] = _LIT if luma[row + i] >= cut else _DARK
+            n_lit += mask[j, i]
     stack = stack_for(mask)
     seed = _seed_near(mask, stack, near_u - u0, near_v - v0)
     if seed < 0:
@@ -152,7 +154,7 @@ def measure_window(
         return False
     out[PLATEAU], out[BACKGROUND], out[TOUCHES] = plateau, background, 1.0 if touches else 0.0
     out[BOX_U], out[BOX_V], out[BOX_WIDTH], out[BOX_HEIGHT] = u0 + x, v0 + y, w, h
-    _moments(luma, stride, u0, v0, mask, x, y, w, h, share, out)
+    _moments(luma, stride, u0, v0, mask, n_lit > n_pixels, x, y, w, h, share, out)
     return True
 
 
@@ -258,7 +260,7 @@ def _near_own(mask: Bytes, reach: int) -> tuple[IntArray, IntArray]:
 
 @compiled
 def _near(mask: Bytes, kind: int, reach: int) -> Bytes:
-    """Return 1 within ``reach`` rows and columns of a pixel of one kind; of size 0 if there is none."""
+    """Return 1 within ``reach`` rows and columns of a pixel of one kind: dilation by a square."""
     rows, columns = mask.shape
     wide = np.zeros((rows, columns), dtype=np.uint8)
     for j in range(rows):
@@ -269,8 +271,6 @@ def _near(mask: Bytes, kind: int, reach: int) -> Bytes:
                 for ii in range(max(i - reach, filled_to), to):
                     wide[j, ii] = 1
                 filled_to = to
-    if not wide.any():
-        return wide[:0]
     out = np.empty((rows, columns), dtype=np.uint8)
     rows_since = np.full(columns, reach + 1, dtype=np.int32)  # a marked one: downwards, then upwards
     for j in range(rows):
@@ -292,6 +292,7 @@ def _moments(
     u0: int,
     v0: int,
     mask: Bytes,
+    has_others: bool,
     x: int,
     y: int,
     w: int,
@@ -305,7 +306,7 @@ def _moments(
     x0, y0 = max(x - reach, 0), max(y - reach, 0)
     part = mask[y0 : min(y + h + reach, mask.shape[0]), x0 : min(x + w + reach, mask.shape[1])]
     first_of_row, last_of_row = _near_own(part, reach)
-    others = _near(part, _LIT, reach)
+    others = _near(part, _LIT, reach) if has_others else part
     weight_of = np.minimum(np.maximum((share - SHARE_LOW) / (SHARE_HIGH - SHARE_LOW), 0.0), 1.0)
     middle_x, middle_y = 0.5 * part.shape[1], 0.5 * part.shape[0]
     area, sum_x, sum_y, sum_xx, sum_xy, sum_yy, n_rim = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
@@ -313,7 +314,7 @@ def _moments(
         row = (v0 + y0 + j) * stride + u0 + x0
         row_area, row_x, row_xx, dy = 0.0, 0.0, 0.0, j - middle_y
         for i in range(first_of_row[j], last_of_row[j] + 1):
-            if others.size and others[j, i] and part[j, i] != _OWN:
+            if has_others and others[j, i] and part[j, i] != _OWN:
                 continue
             weight, dx = weight_of[luma[row + i]], i - middle_x
             row_area += weight
