@@ -1,6 +1,7 @@
 """``bricktrack evaluate``: the source paper's evaluation, simulated or of a recorded sweep."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +11,7 @@ from rich.table import Table
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.cli._console import out
 from bricktrack_host.cli._progress import counting_bar
+from bricktrack_host.cli.process import stage_bar
 
 if TYPE_CHECKING:
     from bricktrack_host.evaluation.scores import SweepScore
@@ -35,6 +37,12 @@ def evaluate(
         Path | None,
         typer.Option("--layout", "-l", help="Layout of the simulated brick. \\[default: the paper's]"),
     ] = None,
+    images: Annotated[
+        bool,
+        typer.Option(
+            "--images", help="Simulate whole pictures: domes, rolling shutter, noise, H.264. Minutes."
+        ),
+    ] = False,
     noise_px: Annotated[
         float,
         typer.Option(min=0.001, max=5.0, help="Noise of simulated centroids and dots, each of u and v."),
@@ -50,11 +58,15 @@ def evaluate(
     Without RUN, a brick is simulated along the paper's sweeps (its section 6.2) with points in place of
     pictures: from plane A to plane B in steps of 1 mm, from corner to corner, and rotations to 30 degrees
     about each axis; then orientations to 45 degrees are identified from nothing. Rays are calibrated from
-    noisy dots of a lens that the product does not know. All figures are then simulated, and say so.
+    noisy dots of a lens that the product does not know. With --images the brick is filmed instead, moving
+    on by 1 mm or 1 degree from picture to picture, and solved with and without dome model and row times.
+    All figures are then simulated, and say so.
 
     For example:
 
         bricktrack evaluate
+
+        bricktrack evaluate --images --seed 3
 
         bricktrack evaluate --noise-px 0.1 --seed 7 --json
 
@@ -64,6 +76,8 @@ def evaluate(
         raise ConfigError("a recorded sweep needs both RUN and --positions; a simulated one neither")
     if run is not None and positions is not None:
         _recorded(run, positions, align=align, output=output, as_json=as_json)
+    elif images:
+        _filmed(seed, output=output, as_json=as_json)
     else:
         _simulated(layout, noise_px=noise_px, seed=seed, output=output, as_json=as_json)
 
@@ -93,6 +107,36 @@ def _simulated(layout: Path | None, *, noise_px: float, seed: int, output: Path,
     }
     title = f"Simulated sweeps, points with {noise_px:g} px of noise, lens {seed}"
     _write_and_print(found.scores, title, extra, [identity], output=output, as_json=as_json, with_bound=True)
+
+
+def _filmed(seed: int, *, output: Path, as_json: bool) -> None:
+    from bricktrack_host.evaluation import summary
+    from bricktrack_host.evaluation.filmed_sweeps import evaluate_film
+
+    with stage_bar(f"evaluation, unit {seed}") as bar:
+
+        def stage(name: str) -> Callable[[int, int], None]:
+            bar.stage(name, None)
+            return lambda done, of: show(name, done, of)
+
+        def show(name: str, done: int, of: int) -> None:
+            if done <= 1:
+                bar.stage(name, of)
+            bar.advance_to(done)
+
+        scores = evaluate_film(output / f"film_{seed}", seed=seed, stage=stage)
+    chosen, *others = scores
+    lines = ["Filmed while moving on by 1 mm or 1 degree from picture to picture, 30 a second."]
+    for name in others:
+        mm, deg = summary.pooled(scores[name])
+        lines.append(f"{name}: {mm[0]:.4f}, {mm[1]:.4f}, {mm[2]:.4f} mm and {deg:.4f} deg over all sweeps.")
+    extra = {
+        "simulated": True,
+        "seed": seed,
+        "also": {name: summary.as_json(scores[name])["all"] for name in others},
+    }
+    title = f"Simulated sweeps on film, unit {seed}: {chosen}"
+    _write_and_print(scores[chosen], title, extra, lines, output=output, as_json=as_json, with_bound=False)
 
 
 def _recorded(run: Path, positions: Path, *, align: bool, output: Path, as_json: bool) -> None:

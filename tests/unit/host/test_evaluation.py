@@ -7,6 +7,7 @@ from typer.testing import CliRunner
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.cli.main import app
+from bricktrack_host.evaluation import filmed, filmed_sweeps
 from bricktrack_host.evaluation.bound import cramer_rao_covariance
 from bricktrack_host.evaluation.paper_brick import paper_brick
 from bricktrack_host.evaluation.recorded import read_positions, score_recording
@@ -15,6 +16,7 @@ from bricktrack_host.evaluation.simulated_points import score_points
 from bricktrack_host.evaluation.summary import pooled
 from bricktrack_host.evaluation.sweeps import Sweep, paper_sweeps
 from bricktrack_host.evaluation.true_camera import PLANE_A_MM, PLANE_B_MM, TrueCamera
+from bricktrack_host.tracking.optical_track import solve_poses
 from bricktrack_host.tracks import OpticalTrack
 
 BRICK = paper_brick()
@@ -160,3 +162,39 @@ def test_a_sweep_without_poses_has_no_errors():
     sweep = Sweep("x", np.arange(2.0), "mm", np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
     score = score_sweep(sweep, np.full((2, 3, 3), np.nan), np.full((2, 3), np.nan))
     assert score.n_posed == 0 and np.isnan(score.rms_mm).all() and np.isnan(score.rms_deg)
+
+
+def test_the_filmed_sweeps_move_on_by_one_step_a_frame():
+    path, names, spans = filmed_sweeps._path()
+    assert names == ["between the planes", "corner to corner", *(f"rotation about {a}" for a in "xyz")]
+    depth, diagonal, *turns = (path[s] for s in spans)
+    np.testing.assert_allclose(np.diff(depth[:, 2]), 1.0)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(diagonal[:, :2], axis=0), axis=1), 1.0)
+    for axis, turn in enumerate(turns):
+        np.testing.assert_allclose(np.diff(turn[:, 3 + axis]), 1.0)
+        # The LEDs' middle stays where it is.
+        R = Rotation.from_rotvec(turn[:, 3:], degrees=True).as_matrix()
+        middle = R @ filmed_sweeps._MIDDLE_BRICK_MM + turn[:, :3]
+        np.testing.assert_allclose(middle, np.tile(filmed_sweeps._MIDDLE_BRICK_MM, (len(turn), 1)), atol=1e-9)
+    # Nothing jumps: at most 0.3 m/s from one frame to the next.
+    assert np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).max() < 10.0
+
+
+@pytest.mark.slow
+def test_a_film_comes_with_all_that_it_takes_to_solve_it(tmp_path):
+    done = []
+    filmed.make_film(
+        tmp_path, seed=4, seconds=0.4, motion="sines", progress=lambda n, of: done.append((n, of))
+    )
+    assert done == [(k, 12) for k in range(1, 13)]
+    film = filmed.open_film(tmp_path)
+    seen = film.observe()
+    track = solve_poses(seen, film.rays, film.brick)
+    error = np.linalg.norm(track.t_camera_brick_mm - film.t_camera_brick_mm, axis=1)
+    assert error.max() < 0.3  # the first frames of a film have neighbours on one side only
+
+
+def test_a_simulator_that_fails_is_an_error_that_says_why(tmp_path):
+    (tmp_path / "motion.csv").write_text("nothing\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"ended with code 1: .*motion_csv"):
+        filmed.make_film(tmp_path, seed=1, seconds=0.1, motion_csv=tmp_path / "motion.csv")
