@@ -113,7 +113,7 @@ def band(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Dots:
+class Scatter:
     """Round dots, with bars of ``half`` up and down where given; NaN draws none."""
 
     x: FloatArray

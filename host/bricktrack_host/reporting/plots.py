@@ -12,7 +12,7 @@ from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting.chart import INK as INK
 from bricktrack_host.reporting.chart import Chart, Panel, panel_grid
-from bricktrack_host.reporting.chart_marks import Dots, Instants, Line, Spans, band
+from bricktrack_host.reporting.chart_marks import Instants, Line, Scatter, Spans, band
 from bricktrack_host.reporting.thinning import thinned, thinned_band
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.run_summary import KeyFigures, main_track
@@ -175,10 +175,10 @@ def motion_chart(
             )
         seen_s, seen = optical_s[chosen], optical_y[chosen, i]
         if span_s is None:
-            panel.add(Dots(seen_s, seen, OPTICAL, 1.9, label="optical"))
+            panel.add(Scatter(seen_s, seen, OPTICAL, 1.9, label="optical"))
         else:
             half = 1.96 * optical_sd[chosen, i]
-            panel.add(Dots(seen_s, seen, OPTICAL, 3.0, half=half, label="optical, 95 %"))
+            panel.add(Scatter(seen_s, seen, OPTICAL, 3.0, half=half, label="optical, 95 %"))
         panel.y_label = names[i]
         panel.x_limits = span_s
     for panel in chart.panels[-1]:

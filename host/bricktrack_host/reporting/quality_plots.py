@@ -5,7 +5,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.imu_records import UNUSABLE
 from bricktrack_host.reporting.chart import Chart, panel_grid, picture_chart
-from bricktrack_host.reporting.chart_marks import Area, Arrows, Dots, Signs, Words, band
+from bricktrack_host.reporting.chart_marks import Area, Arrows, Scatter, Signs, Words, band
 from bricktrack_host.reporting.plots import (
     FUSED,
     IMPACT,
@@ -38,7 +38,7 @@ def residual_time_chart(result: RunResult) -> Chart:
             colour, y = LED_COLOURS[i % len(LED_COLOURS)], residual[:, i, k]
             beyond = np.abs(y) > limit
             panel.add(
-                Dots(t_s, y, colour, size_pt, label=name),
+                Scatter(t_s, y, colour, size_pt, label=name),
                 Signs(t_s[beyond], np.sign(y[beyond]) * limit * 0.97, colour, size_pt=4.0),
             )
         panel.y_limits, panel.y_label = (-limit, limit), f"residual {'uv'[k]}, px"
@@ -55,7 +55,7 @@ def residual_picture_chart(result: RunResult) -> Chart:
     means = []
     for i, name in enumerate(result.led_names):
         colour = LED_COLOURS[i % len(LED_COLOURS)]
-        panel.add(Dots(uv[:, i, 0], uv[:, i, 1], colour, 0.75, opacity=0.5))
+        panel.add(Scatter(uv[:, i, 0], uv[:, i, 1], colour, 0.75, opacity=0.5))
         used = np.isfinite(residual[:, i]).all(axis=1)
         if used.any():
             at = np.median(uv[used, i], axis=0)
@@ -80,7 +80,7 @@ def timing_chart(result: RunResult, figures: KeyFigures) -> Chart:
     if len(stamps) > 2:
         off_us, periods = frame_intervals_us(result, figures)
         at_s, whole, gap = axis.s(stamps[1:]), periods == 1, periods > 1
-        frames.add(Dots(at_s[whole], off_us[whole], OPTICAL, 1.8))
+        frames.add(Scatter(at_s[whole], off_us[whole], OPTICAL, 1.8))
         if gap.any():
             frames.add(Signs(at_s[gap], off_us[gap], IMPACT, label="after dropped frames"))
         limit = max(20.0, 1.2 * float(np.abs(off_us).max()))
@@ -92,7 +92,7 @@ def timing_chart(result: RunResult, figures: KeyFigures) -> Chart:
     if late_us is None or result.imu is None:
         samples.note, samples.y_ticks = "no inertial samples", False
     else:
-        samples.add(Dots(axis.s(result.imu.t_ns), late_us / 1000, FUSED, 1.2))
+        samples.add(Scatter(axis.s(result.imu.t_ns), late_us / 1000, FUSED, 1.2))
         samples.y_label = "after slot, ms"
         if np.nanmin(late_us, initial=0.0) >= 0:
             samples.y_from = 0.0
@@ -101,7 +101,7 @@ def timing_chart(result: RunResult, figures: KeyFigures) -> Chart:
     if fit is None:
         edges.note, edges.y_ticks = "no edges, or no line through them", False
     else:
-        edges.add(Dots(axis.s(fit.edges_ns), fit.residual_ns / 1000, TRUTH, 1.1))
+        edges.add(Scatter(axis.s(fit.edges_ns), fit.residual_ns / 1000, TRUTH, 1.1))
         missed_s = axis.s(fit.time_of_index(fit.missed_index))
         if len(missed_s):
             edges.add(Signs(missed_s, np.zeros(len(missed_s)), IMPACT, "|", 9.0, "missed edge"))
@@ -148,10 +148,10 @@ def alignment_chart(result: RunResult) -> Chart | None:
         top.title = f"about brick {'xyz'[i]}"
         top.add(
             line(rates.gyro_s[near], rates.gyro_dps[near, i], colour=FUSED, label="gyroscope less bias"),
-            Dots(rates.optical_s[near_frames], rates.optical_dps[near_frames, i], OPTICAL, 3.0,
+            Scatter(rates.optical_s[near_frames], rates.optical_dps[near_frames, i], OPTICAL, 3.0,
                  label="optical, frame to frame"),
         )  # fmt: skip
-        low.add(Dots(rates.optical_s, rates.difference_dps[:, i], INK, 1.1))
+        low.add(Scatter(rates.optical_s, rates.difference_dps[:, i], INK, 1.1))
         low.y_limits, low.x_label = (-limit, limit), "time, s"
     chart.panels[0][0].y_label, chart.panels[1][0].y_label = "rate, deg/s", "difference, deg/s"
     return chart
@@ -186,7 +186,7 @@ def calibration_chart(calibration: CalibrationPicture, uv_px: FloatArray | None 
         panel.add(Area([(outline[:, 0], outline[:, 1])], "#dce8dd", 0.8, TRUTH, label))
     on_target = calibration.dots_uv_px
     if len(on_target):
-        panel.add(Dots(on_target[:, 0], on_target[:, 1], INK, 1.0, label="dots"))
+        panel.add(Scatter(on_target[:, 0], on_target[:, 1], INK, 1.0, label="dots"))
     residual = calibration.residual_um
     if residual is not None and np.isfinite(residual).any():
         typical = float(np.nanmedian(np.hypot(residual[:, 0], residual[:, 1])))
@@ -198,7 +198,7 @@ def calibration_chart(calibration: CalibrationPicture, uv_px: FloatArray | None 
             panel.title = f"dots and their residuals, median {typical:.1f} um on the target"
     if uv_px is not None:
         uv = uv_px.reshape(-1, 2)
-        panel.add(Dots(uv[:, 0], uv[:, 1], FUSED, 0.75, label="LEDs of this run"))
+        panel.add(Scatter(uv[:, 0], uv[:, 1], FUSED, 0.75, label="LEDs of this run"))
     return chart
 
 
@@ -210,7 +210,7 @@ def truth_chart(result: RunResult, figures: KeyFigures, comparison: TruthCompari
         mark_events(panel, axis, result, figures)
         fused, optical = comparison.series.get("fused"), comparison.series.get("optical")
         if optical is not None:
-            panel.add(Dots(axis.s(optical.t_ns), optical.error[:, i], OPTICAL, 1.4, label="optical"))
+            panel.add(Scatter(axis.s(optical.t_ns), optical.error[:, i], OPTICAL, 1.4, label="optical"))
         if fused is not None:
             t_s, half = axis.s(fused.t_ns), 1.96 * fused.sd[:, i]
             promised = thinned_band(t_s, -half, half)

@@ -11,9 +11,9 @@ from bricktrack_host.reporting.chart_marks import (
     UNITS_PER_PT,
     Area,
     Arrows,
-    Dots,
     Instants,
     Line,
+    Scatter,
     Signs,
     Spans,
     Words,
@@ -79,7 +79,7 @@ def test_nan_interrupts_lines_and_bands_and_draws_no_dot():
     chart, _ = one_panel(
         Line(x, y, "#111111"),
         band(x, y - 1, y + 1, colour="#222222", opacity=0.5),
-        Dots(x, y, "#333333", 1.5),
+        Scatter(x, y, "#333333", 1.5),
     )
     paths, _ = drawn(chart)
     assert paths["#111111"].count("M") == 2
@@ -90,7 +90,7 @@ def test_nan_interrupts_lines_and_bands_and_draws_no_dot():
 def test_dots_are_strokes_of_no_length_at_their_places():
     rng = np.random.default_rng(4)
     x, y = rng.uniform(0, 1, 500), rng.uniform(0, 1, 500)
-    chart, panel = one_panel(Dots(x, y, "#333333", 1.5), x_limits=(0.0, 1.0), y_limits=(0.0, 1.0))
+    chart, panel = one_panel(Scatter(x, y, "#333333", 1.5), x_limits=(0.0, 1.0), y_limits=(0.0, 1.0))
     at = corners(drawn(chart)[0]["#333333"])
     np.testing.assert_allclose(at[:, 0], panel.left_pt + panel.width_pt * x, atol=0.026)
     np.testing.assert_allclose(at[:, 1], panel.top_pt + panel.height_pt * (1 - y), atol=0.026)
@@ -99,7 +99,7 @@ def test_dots_are_strokes_of_no_length_at_their_places():
 
 def test_bars_reach_from_the_low_end_to_the_high():
     chart, panel = one_panel(
-        Dots(np.array([0.5]), np.array([0.5]), "#333333", 3.0, half=np.array([0.25])),
+        Scatter(np.array([0.5]), np.array([0.5]), "#333333", 3.0, half=np.array([0.25])),
         x_limits=(0.0, 1.0),
         y_limits=(0.0, 1.0),
     )
@@ -142,7 +142,7 @@ def test_a_logarithmic_axis_puts_decades_at_equal_steps():
 
 def test_pictures_run_downwards_at_one_scale():
     chart, panel = picture_chart(1920, 1080, legend=True)
-    panel.add(Dots(np.array([0.0, 1919.0]), np.array([0.0, 1079.0]), "#333333", 1.0, label="LEDs"))
+    panel.add(Scatter(np.array([0.0, 1919.0]), np.array([0.0, 1079.0]), "#333333", 1.0, label="LEDs"))
     panel.add(Area([(np.array([0.0, 9.0, 9.0]), np.array([0.0, 0.0, 9.0]))], "#222222", 0.5, "#444444"))
     paths, words = drawn(chart)
     (u0, v0), (u1, v1) = corners(paths["#333333"])
