@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import welch
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import BricktrackError
@@ -52,7 +51,7 @@ def amplitude_spectrum(t_s: FloatArray, values: FloatArray) -> Spectrum:
     --------
     >>> t_s = np.arange(1024) / 100
     >>> spectrum = amplitude_spectrum(t_s, np.sin(2 * np.pi * 6.25 * t_s)[:, None])
-    >>> float(spectrum.f_hz[np.argmax(spectrum.density)])
+    >>> round(float(spectrum.f_hz[np.argmax(spectrum.density)]), 6)
     6.25
     """
     known = np.isfinite(t_s) & np.isfinite(values).all(axis=1)
@@ -65,5 +64,20 @@ def amplitude_spectrum(t_s: FloatArray, values: FloatArray) -> Spectrum:
         raise SpectrumError("the times of a spectrum must rise from sample to sample")
     even_s = np.arange(0, t_s[-1], step_s)
     even = np.stack([np.interp(even_s, t_s, column) for column in values.T], axis=1)
-    f_hz, power = welch(even, 1 / step_s, nperseg=min(len(even), SEGMENT), detrend="constant", axis=0)
-    return Spectrum(np.asarray(f_hz[1:]), np.sqrt(power[1:]))
+    f_hz, power = power_density(even, step_s, n_segment=min(len(even), SEGMENT))
+    return Spectrum(f_hz[1:], np.sqrt(power[1:]))
+
+
+def power_density(values: FloatArray, step_s: float, *, n_segment: int) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies, Hz, and the one-sided power density of each column, its unit squared a Hz.
+
+    Mean over segments that overlap by half, each less its mean, under a Hann window (Welch, 1967). SciPy's
+    `signal.welch` gives the same, and takes half a second to load.
+    """
+    hop = n_segment - n_segment // 2
+    segments = np.lib.stride_tricks.sliding_window_view(values, n_segment, axis=0)[::hop]
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n_segment) / n_segment)
+    spectra = np.fft.rfft((segments - segments.mean(axis=-1, keepdims=True)) * window)
+    density: FloatArray = np.mean(np.abs(spectra) ** 2, axis=0).T * step_s / np.sum(window**2)
+    density[1 : (n_segment + 1) // 2] *= 2  # the negative frequencies; zero and Nyquist's have none
+    return np.asarray(np.fft.rfftfreq(n_segment, step_s), dtype=np.float64), density
