@@ -16,6 +16,7 @@ from bricktrack_host.cli._units import JsonOption
 if TYPE_CHECKING:
     from bricktrack_common.arrays import FloatArray
     from bricktrack_host.fusion.alignment_report import AlignmentReport
+    from bricktrack_host.fusion.mount import Mount
     from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _STAMPS_SD_S = 5e-3  # one clock stamps both, and the lags in the sensors are a few ms
@@ -76,6 +77,10 @@ def align(
         Path | None,
         typer.Option("--plot", "-p", help="Picture to write: .png, .pdf or .svg.", show_default=False),
     ] = None,
+    mount: Annotated[
+        bool,
+        typer.Option("--mount", help="Refine the IMU's axes and place in the brick too; needs --layout."),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Say by how much camera and IMU differ in time, how sure that is, and whether their stamps agree.
@@ -95,12 +100,16 @@ def align(
     if plot is not None and len(sources) > 1:
         raise ConfigError(f"--plot is for one recording; {len(sources)} were given")
     lever_arm_mm = _lever_arm(layout)
+    if mount and lever_arm_mm is None:
+        raise ConfigError("--mount refines what a layout file says: name it with --layout")
     rows: list[dict[str, object]] = []
     failed = 0
     for run in sources:
         try:
             with err.status(f"{run or poses}: comparing both motions", spinner="dots"):
-                report, simulated = _report(run, poses, imu, lever_arm_mm, within, stamps_sd_ms)
+                report, simulated = _report(
+                    run, poses, imu, lever_arm_mm, within, stamps_sd_ms, with_mount=mount
+                )
         except BricktrackError as e:
             if len(sources) == 1:
                 raise
@@ -152,6 +161,8 @@ def _report(
     lever_arm_mm: "FloatArray | None",
     within_s: float,
     stamps_sd_ms: float | None,
+    *,
+    with_mount: bool,
 ) -> "tuple[AlignmentReport, bool]":
     """Return the report, and whether the recording is a simulated one."""
     from bricktrack_host.fusion.alignment_report import report_alignment
@@ -163,8 +174,9 @@ def _report(
         optical, samples = _read_files(poses, imu)
     sd_ms = stamps_sd_ms or 1e3 * (_STAMPS_SD_S if own_clock else within_s)
     report = report_alignment(
-        optical, samples, lever_arm_mm=lever_arm_mm, prior_sd_ns=sd_ms * 1e6, max_offset_s=within_s
-    )
+        optical, samples, lever_arm_mm=lever_arm_mm, prior_sd_ns=sd_ms * 1e6, max_offset_s=within_s,
+        with_mount=with_mount,
+    )  # fmt: skip
     return report, simulated
 
 
@@ -222,6 +234,8 @@ def _say(name: str, report: "AlignmentReport") -> None:
         )
     if f["correlation"] is not None:
         table.add_row("correlation of angular speeds", f"{f['correlation']:.3f}")
+    if report.mount is not None:
+        _add_mount(table, report.mount)
     if f["stamps_agree"] is None:
         verdict = "the motion tells no offset: the stamps are all there is"
     elif f["stamps_agree"]:
@@ -232,3 +246,24 @@ def _say(name: str, report: "AlignmentReport") -> None:
     if f["remark"]:
         table.add_row("", str(f["remark"]))
     out.print(table)
+
+
+def _add_mount(table: Table, mount: "Mount") -> None:
+    import numpy as np
+
+    def told(values: "FloatArray", sds: "FloatArray", unit: str) -> str:
+        return (
+            ", ".join(
+                f"{v:.2f} ± {sd:.2f}" if np.isfinite(v) else "not told"
+                for v, sd in zip(values.tolist(), sds.tolist(), strict=True)
+            )
+            + f" {unit}"
+        )
+
+    turn, turn_sd = np.rad2deg(mount.rvec_layout_rad), np.rad2deg(mount.rvec_sd_rad)
+    table.add_row("IMU's axes against the layout's", told(turn, turn_sd, "deg about x, y, z of the brick"))
+    table.add_row("IMU's place", told(mount.lever_arm_mm, mount.lever_arm_sd_mm, "mm from the first LED"))
+    table.add_row(
+        "gravity when quiet",
+        f"{mount.gravity_mps2:.2f} m/s², {mount.gravity_off_deg:.1f} deg from that of the whole run",
+    )

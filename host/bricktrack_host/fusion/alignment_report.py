@@ -10,6 +10,7 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.mount import Mount, refine_mount
 from bricktrack_host.fusion.rotation_fit import Correlation, correlate
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times, has_pose
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
@@ -30,6 +31,8 @@ class AlignmentReport:
         What the stamps promise.
     correlation : Correlation
         Of the angular rates over offsets.
+    mount : Mount or None
+        Where the sensor sits, if that was asked for.
     t_s : ndarray, shape (n,), s
         Middles of neighbouring frames, after the first.
     optical_radps, gyro_radps : ndarray, shape (n,)
@@ -41,6 +44,7 @@ class AlignmentReport:
     prior_offset_ns: float
     prior_sd_ns: float
     correlation: Correlation
+    mount: Mount | None
     t_s: FloatArray
     optical_radps: FloatArray
     gyro_radps: FloatArray
@@ -82,6 +86,16 @@ class AlignmentReport:
                 "acc_lag_sd_ms": f.acc_lag_sd_ns / 1e6,
             }
         plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in found.items()}
+        if self.mount is not None:
+            m = self.mount
+            plain |= {
+                "mount_rvec_deg": np.rad2deg(m.rvec_layout_rad).tolist(),
+                "mount_rvec_sd_deg": np.rad2deg(m.rvec_sd_rad).tolist(),
+                "lever_arm_mm": [v if math.isfinite(v) else None for v in m.lever_arm_mm.tolist()],
+                "lever_arm_sd_mm": [v if math.isfinite(v) else None for v in m.lever_arm_sd_mm.tolist()],
+                "gravity_off_deg": m.gravity_off_deg,
+                "gravity_mps2": m.gravity_mps2,
+            }
         return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in plain.items()}
 
     @staticmethod
@@ -99,6 +113,7 @@ def report_alignment(
     prior_offset_ns: float = 0.0,
     prior_sd_ns: float = 5e6,
     max_offset_s: float = 0.25,
+    with_mount: bool = False,
 ) -> AlignmentReport:
     """Return what a recording tells of its clocks.
 
@@ -111,6 +126,8 @@ def report_alignment(
         What the stamps promise; a wide sd where camera and IMU were stamped by different clocks.
     max_offset_s : float
         How far from that to look.
+    with_mount : bool
+        Whether to refine where the sensor sits; needs the lever arm and a motion that tells the offset.
 
     Raises
     ------
@@ -122,11 +139,13 @@ def report_alignment(
     alignment = align_times(
         optical, imu, max_offset_s=max_offset_s, prior_offset_ns=prior_offset_ns, prior_sd_ns=prior_sd_ns
     )
-    fused = None
+    fused, mount = None, None
     if lever_arm_mm is not None and alignment.source == "data":
         fused = fuse(
             optical, imu, lever_arm_mm=lever_arm_mm, output_t_ns=optical.t_ns[:0], alignment=alignment
         )
+        if with_mount:
+            mount = refine_mount(optical, imu, lever_arm_mm=lever_arm_mm, alignment=alignment)
     clock = alignment.sample_clock
     signal = ImuSignal.from_track(imu if clock is None else clock.restamp(imu))
     seen = has_pose(optical)
@@ -143,6 +162,7 @@ def report_alignment(
         prior_offset_ns=prior_offset_ns,
         prior_sd_ns=prior_sd_ns,
         correlation=correlate(t_cam_s, R, signal, centre_s=prior_offset_ns * 1e-9, max_offset_s=max_offset_s),
+        mount=mount,
         t_s=(0.5 * (t_cam_s[1:] + t_cam_s[:-1]) - t_cam_s[0])[pair],
         optical_radps=np.linalg.norm(turn / dt[:, None], axis=1)[pair],
         gyro_radps=np.linalg.norm(gyro, axis=1)[pair],

@@ -10,16 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.fusion.fusion_problem import (
-    NoiseLevel,
-    Run,
-    build_problem,
-    first_linearisation,
-    place_nodes,
-)
+from bricktrack_host.fusion.fusion_problem import Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.moving_camera import CameraMotion
-from bricktrack_host.fusion.smoother import score_noise
+from bricktrack_host.fusion.noise_choice import frames_log_likelihood
 from bricktrack_host.fusion.time_alignment import TimeAlignment
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
@@ -59,7 +53,7 @@ def settle_delay(
             optical, imu, alignment, lever_arm_mm=lever_arm_mm,
             output_t_ns=optical.t_ns[:0], camera=replace(motion, delay_s=delay_s),
         )  # fmt: skip
-        return _log_likelihood(run, settings)
+        return frames_log_likelihood(run, settings)
 
     best = motion.delay_s
     for i, step in enumerate(_STEPS_S[1:] if is_near else _STEPS_S):
@@ -71,15 +65,3 @@ def settle_delay(
         bend = before - 2 * at + after
         best = float(tried[top] + (0.5 * step * (before - after) / bend if bend < 0 else 0.0))
     return replace(motion, delay_s=best)
-
-
-def _log_likelihood(run: Run, settings: FusionSettings) -> float:
-    lin = first_linearisation(run, settings)
-    nodes = place_nodes(run, lin)
-    level = NoiseLevel(settings.roughness_share, 1.0)
-    problem, parts = build_problem(
-        [run], [nodes], [lin], settings=settings, use_frame=[np.ones(len(run.t_cam_s), dtype=np.bool_)],
-        noise_scale=[np.ones(2)], levels=[(level, level)],
-    )  # fmt: skip
-    gyro, acc = parts[0].gyro(level), parts[0].acc(level)
-    return float(score_noise(problem, gyro[None, None], acc[None, None])[0][0, 0])

@@ -12,6 +12,8 @@ from bricktrack_host.fusion.fusion_problem import (
     NoiseParts,
     Run,
     build_problem,
+    first_linearisation,
+    place_nodes,
 )
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem, residuals, score_noise
@@ -155,3 +157,16 @@ def _choose_noise(
     log_likelihood, last = score_noise(problem, gyro, acc)
     best = np.argmax(log_likelihood - price, axis=1)
     return [levels[i] for i in best], [last[b, i] for b, i in enumerate(best)]
+
+
+def frames_log_likelihood(run: Run, settings: FusionSettings) -> float:
+    """Return how likely the frames of a run are under the filter, with the noise that is stated."""
+    lin = first_linearisation(run, settings)
+    nodes = place_nodes(run, lin)
+    level = NoiseLevel(settings.roughness_share, 1.0)
+    problem, parts = build_problem(
+        [run], [nodes], [lin], settings=settings, use_frame=[np.ones(len(run.t_cam_s), dtype=np.bool_)],
+        noise_scale=[np.ones(2)], levels=[(level, level)],
+    )  # fmt: skip
+    gyro, acc = parts[0].gyro(level), parts[0].acc(level)
+    return float(score_noise(problem, gyro[None, None], acc[None, None])[0][0, 0])

@@ -81,11 +81,17 @@ def test_an_offset_out_of_reach_is_not_guessed(files):
 
 def test_with_the_lever_arm_the_lag_of_the_accelerometer_is_found(shake, tmp_path):
     report = report_alignment(
-        shake.optical, shake.imu, lever_arm_mm=LEVER_ARM_MM, prior_sd_ns=2e9, max_offset_s=2.0
+        shake.optical,
+        shake.imu,
+        lever_arm_mm=LEVER_ARM_MM,
+        prior_sd_ns=2e9,
+        max_offset_s=2.0,
+        with_mount=True,
     )
     found = report.figures()
     assert found["acc_lag_ms"] == pytest.approx(-3.4, abs=0.4)
     assert abs(found["smoothed_offset_ms"] - 1e3 * OFFSET_S) < 4 * found["smoothed_offset_sd_ms"]
+    assert np.allclose(found["lever_arm_mm"], LEVER_ARM_MM, atol=1.0)
     # The gyro at the offset found is what the camera saw, frame by frame: 0.1 deg of noise an axis.
     off = np.abs(report.optical_radps - report.gyro_radps)
     assert np.nanmedian(off) < np.radians(0.1 * np.sqrt(2) * 30)
