@@ -141,7 +141,7 @@ def _choose_noise(
     The roughness of the accelerometer may count for less than stated, the systematic errors of both sensors
     for more: all choices of all runs as one batch. The stated level stands unless another earns its price.
     """
-    steps = [(i, j) for i in (0, -1, -2) for j in (0, -1, -2, 1, 2)]
+    steps = [(i, j) for i in (0, -1, -2, -3) for j in (0, -1, -2, 1, 2)]
     price = np.array([_EARN_PER_STEP * (abs(i) + abs(j)) for i, j in steps])
     share = settings.roughness_share
     levels = [
