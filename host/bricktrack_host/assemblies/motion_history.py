@@ -97,13 +97,18 @@ def run_history(
     if origin_ns is None:
         stamps = result.observations.sensor_timestamp_ns
         origin_ns = int(stamps[0]) if len(stamps) else 0
-    n, fit = len(track.t_ns), result.edge_fit
+    if at == "edge":
+        sample = result.edge_index.astype(np.float64)
+    elif result.edge_fit is not None:
+        sample = result.edge_fit.sample_index_of(track.t_ns)
+    else:
+        sample = np.full(len(track.t_ns), np.nan)
     motion = motion_from_rest(track, result.rest).about(point_mm)
     sd = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
     return MotionHistory(
         name=result.manifest.unit,
         t_s=np.asarray((track.t_ns - origin_ns) / 1e9),
-        sample=np.full(n, np.nan) if fit is None else fit.sample_index_of(track.t_ns),
+        sample=sample,
         displacement_mm=motion.t_mm,
         rotation_deg=np.rad2deg(rvec_from_matrix(motion.R)),
         displacement_sd_mm=sd[:, 3:],

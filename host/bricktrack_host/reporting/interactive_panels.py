@@ -75,6 +75,7 @@ class TimePanels:
     def panel(self, y_label: str, *, title: str = "", height_px: int = _HEIGHT_PX) -> figure:
         """Return an empty panel."""
         new = styled_panel(y_label, title=title, height_px=height_px, x_range=self._range)
+        new.name = "over time"
         new.add_tools(CrosshairTool(overlay=self._pointer))
         if len(self._events.dropouts_s):
             first, last = self._events.dropouts_s.T

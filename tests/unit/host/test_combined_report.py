@@ -1,12 +1,12 @@
 """The report of a test: links that lead somewhere, problems first, numbers those of the tables."""
 
 import re
-from dataclasses import replace
 from urllib.parse import unquote, urlparse
 
 import msgspec
 import numpy as np
 import pytest
+from small_lab import BRICK, UNITS, example, invented_run
 
 from bricktrack_common.errors import RunFormatError, StorageError
 from bricktrack_host.assemblies.combined_test import combine_test, read_components, read_test
@@ -19,10 +19,7 @@ from bricktrack_host.reporting.combined_report import (
     verdict,
     write_combined_report,
 )
-from bricktrack_host.results.result_store import write_results
-from bricktrack_host.transfer.fleet_config import load_fleet
 
-from .test_export import FLEET, example
 from .test_report import parsed
 
 
@@ -30,20 +27,15 @@ from .test_report import parsed
 def folder(tmp_path_factory):
     """A combined test of two units (invented, simulated), in a folder whose name needs quoting in a link."""
     lab = tmp_path_factory.mktemp("lab")
-    (lab / "fleet.toml").write_text(FLEET)
-    blank = example.example_result()
     results = {}
-    for unit in ("b7-1", "b7-2"):
-        results[unit] = lab / "runs 100 %" / f"{unit}_0001_shake" / "results"
-        results[unit].parent.mkdir(parents=True)
-        manifest = msgspec.structs.replace(blank.manifest, unit=unit, run_id=f"{unit}_0001_shake")
-        write_results(replace(blank, manifest=manifest), results[unit])
-        (results[unit] / "report.html").write_text("a run's report")
+    for unit in UNITS:
+        run = lab / "runs 100 %" / f"{unit}_0001_shake"
+        invented_run(run, unit)
+        (run / "results" / "report.html").write_text("a run's report")
+        results[unit] = run / "results"
     test = lab / "tests" / "shake-12"
     test.parent.mkdir()
-    combine_test(
-        "shake-12", results, load_fleet(lab / "fleet.toml").assembly, test, also=write_combined_report
-    )
+    combine_test("shake-12", results, [BRICK], test, also=write_combined_report)
     return test
 
 

@@ -1,0 +1,48 @@
+"""A laboratory of two units whose runs are invented (simulated), processed, and of one brick in three parts."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import msgspec
+
+from bricktrack_common.run_manifest import MANIFEST_NAME, write_manifest
+from bricktrack_host.results.result_store import RunResult, write_results
+from bricktrack_host.transfer.assembly_config import AssemblyConfig, Component, View
+
+UNITS = ("b7-1", "b7-2")
+BRICK = AssemblyConfig(
+    name="brick-7",
+    kind="TCB",
+    base="A",
+    component=[Component(name="A"), Component(name="B"), Component(name="C", point_mm=(0.0, 0.0, 60.0))],
+    view=[
+        View(unit="b7-1", camera_on="A", leds_on="B", position_brick_layout_mm=(10.0, 20.0, 30.0)),
+        View(unit="b7-2", camera_on="B", leds_on="C", position_brick_layout_mm=(-10.0, 20.0, 30.0)),
+    ],
+)
+
+
+def _example() -> ModuleType:
+    path = Path(__file__).parents[2] / "scripts" / "example_report.py"
+    spec = importlib.util.spec_from_file_location("example_report", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+example = _example()
+
+
+def invented_run(folder: Path, unit: str) -> RunResult:
+    """Write the manifest and the results of one invented run to a folder."""
+    blank: RunResult = example.example_result()
+    manifest = msgspec.structs.replace(blank.manifest, unit=unit, run_id=f"{unit}_0001_shake")
+    result = replace(blank, manifest=manifest)
+    folder.mkdir(parents=True)
+    write_manifest(folder / MANIFEST_NAME, manifest)
+    write_results(result, folder / "results")
+    return result
