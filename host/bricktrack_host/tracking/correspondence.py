@@ -32,8 +32,8 @@ from bricktrack_host.tracking.verification import (
 )
 
 _MAX_SEARCH_BLOBS = 12
-_RIVAL_EVIDENCE = 9.0  # three sigma
-_USUAL_SD_PX, _USUAL_WEIGHT = 1.0, 4.0  # of residuals, before any were seen; worth so many of them
+_RIVAL_EVIDENCE = 6.0  # twenty to one
+_USUAL_SD_PX, _USUAL_WEIGHT = 0.3, 2.0  # of residuals, before any were seen; worth so many of them
 
 
 def assign_predicted(
@@ -152,13 +152,14 @@ def _evidence(residual_px: FloatArray, kept: BoolArray, n_pixels: int) -> FloatA
 
     A blob that is its LED lies within its residuals' scatter, which each assignment shows itself (a rolling
     shutter or an unfitted profile leaves several pixels); one that is not lies anywhere in the picture. So a
-    sixth LED found at eight pixels does not outweigh that the five others then miss their blobs as well.
+    sixth LED found at eight pixels does not outweigh that the five others then miss their blobs as well. Any
+    three blobs can be fitted, so only what is beyond three LEDs is evidence.
     """
     n_leds = kept.sum(axis=1)
     squares = np.where(kept, np.nan_to_num(residual_px**2).sum(axis=-1), 0.0).sum(axis=1)
     freedom = np.maximum(2 * n_leds - 6, 0)
     variance = (squares + _USUAL_WEIGHT * _USUAL_SD_PX**2) / (freedom + _USUAL_WEIGHT)
-    evidence = 2 * n_leds * np.log(n_pixels / (2 * np.pi * variance)) - squares / variance
+    evidence = freedom * np.log(n_pixels / (2 * np.pi * variance)) - squares / variance
     return np.where(n_leds >= MIN_INLIERS, evidence, -np.inf)
 
 
