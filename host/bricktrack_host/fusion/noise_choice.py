@@ -19,6 +19,7 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem, residuals, score_noise
 
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
+_MOST_SYSTEMATIC = 2  # steps
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
 _MAX_SCALE_ROUNDS = 4
 _SCALE_STANDS = 1.25
@@ -139,24 +140,40 @@ def _choose_noise(
     And the last state of the filter that has them, shape (22,).
 
     The roughness of the accelerometer may count for less than stated, the systematic errors of both sensors
-    for more: all choices of all runs as one batch. The stated level stands unless another earns its price.
+    for more or less: first these, then that, then these once more. The stated level stands unless another
+    earns its price.
     """
-    steps = [(i, j) for i in (0, -1, -2, -3) for j in (0, -1, -2, 1, 2)]
-    price = np.array([_EARN_PER_STEP * (abs(i) + abs(j)) for i, j in steps])
-    share = settings.roughness_share
-    levels = [
-        (NoiseLevel(share, _LEVEL_STEP**j), NoiseLevel(share * _LEVEL_STEP**i, _LEVEL_STEP**j))
-        for i, j in steps
-    ]
-    shape = (len(parts), len(levels), len(problem.dt_s))
-    gyro, acc = np.zeros(shape), np.zeros(shape)
-    for b, part in enumerate(parts):
-        for i, (of_gyro, of_acc) in enumerate(levels):
-            gyro[b, i, : len(part.gyro_fixed)] = part.gyro(of_gyro)
-            acc[b, i, : len(part.acc_fixed)] = part.acc(of_acc)
-    log_likelihood, last = score_noise(problem, gyro, acc)
-    best = np.argmax(log_likelihood - price, axis=1)
-    return [levels[i] for i in best], [last[b, i] for b, i in enumerate(best)]
+    stated = (0, 0)  # steps of roughness, of systematic errors
+    chosen = [stated] * len(parts)
+    scores: list[dict[tuple[int, int], float]] = [{} for _ in parts]
+    last: list[dict[tuple[int, int], FloatArray]] = [{} for _ in parts]
+    for moves in (
+        [(0, 0), (0, -1), (0, -2), (0, 1), (0, 2)],
+        [(-1, 0), (-2, 0), (-3, 0)],
+        [(0, -1), (0, 1)],
+    ):
+        tried = [[(i + di, j + dj) for di, dj in moves] for i, j in chosen]
+        shape = (len(parts), len(moves), len(problem.dt_s))
+        gyro, acc = np.zeros(shape), np.zeros(shape)
+        for b, part in enumerate(parts):
+            for n, step in enumerate(tried[b]):
+                of_gyro, of_acc = _levels(step, settings)
+                gyro[b, n, : len(part.gyro_fixed)] = part.gyro(of_gyro)
+                acc[b, n, : len(part.acc_fixed)] = part.acc(of_acc)
+        log_likelihood, ends = score_noise(problem, gyro, acc)
+        for b, steps in enumerate(tried):
+            for n, (i, j) in enumerate(steps):
+                if abs(j) <= _MOST_SYSTEMATIC:
+                    scores[b][i, j] = float(log_likelihood[b, n]) - _EARN_PER_STEP * (abs(i) + abs(j))
+                    last[b][i, j] = ends[b, n]
+        chosen = [max(score, key=score.__getitem__) for score in scores]
+    return [_levels(step, settings) for step in chosen], [last[b][step] for b, step in enumerate(chosen)]
+
+
+def _levels(step: tuple[int, int], settings: FusionSettings) -> tuple[NoiseLevel, NoiseLevel]:
+    """Return the levels of gyro and accelerometer, so many steps of roughness and systematic errors away."""
+    share, systematic = settings.roughness_share, _LEVEL_STEP ** step[1]
+    return NoiseLevel(share, systematic), NoiseLevel(share * _LEVEL_STEP ** step[0], systematic)
 
 
 def frames_log_likelihood(run: Run, settings: FusionSettings) -> float:
