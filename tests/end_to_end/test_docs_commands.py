@@ -166,6 +166,20 @@ def test_the_examples_in_a_help_text_are_commands_the_program_takes(path):
     assert not refused, "\n".join(refused)
 
 
+@pytest.mark.parametrize("program", sorted(PROGRAMS))
+def test_the_reference_describes_every_command_and_option(program, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs" / "_ext")
+    sections = re.split(
+        r"^### ", importlib.import_module("command_reference").commands_page(program), flags=re.M
+    )
+    described = {section.partition("\n")[0]: section for section in sections}
+    for path, command in LEAVES.items():
+        if path.split()[0] == program:
+            options = {name for p in command.params for name in p.opts if name.startswith("--")}
+            unsaid = [name for name in options - {"--help"} if name not in described[path]]
+            assert not unsaid, f"{path}: {unsaid}"
+
+
 @pytest.mark.parametrize(
     ("line", "why"),
     [
