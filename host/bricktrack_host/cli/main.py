@@ -11,6 +11,7 @@ from bricktrack_host.cli import (
     calibrate_leds,
     combine,
     configure,
+    dashboard,
     delete,
     demo,
     evaluate,
@@ -71,6 +72,7 @@ app.command("find", rich_help_panel=_UNITS)(find.find)
 app.command("status", rich_help_panel=_UNITS)(status.status)
 app.command("arm", rich_help_panel=_UNITS)(fleet.arm)
 app.command("disarm", rich_help_panel=_UNITS)(fleet.disarm)
+app.command("dashboard", rich_help_panel=_UNITS)(dashboard.dashboard)
 app.command("still", rich_help_panel=_UNITS)(still.still)
 app.command("configure", rich_help_panel=_UNITS)(configure.configure)
 app.command("delete", rich_help_panel=_UNITS)(delete.delete)
