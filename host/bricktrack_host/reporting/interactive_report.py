@@ -133,9 +133,11 @@ def render_plots(
 
 def _time_panels(result: RunResult, figures: KeyFigures) -> TimePanels:
     axis = TimeAxis.of(result)
-    stamps = [result.observations.sensor_timestamp_ns, result.optical.t_ns]
-    stamps += [] if result.imu is None else [result.imu.t_ns]
-    known = axis.s(np.concatenate(stamps))
+    # Of what the camera saw: inertial samples before and after it are a pan away.
+    stamps = result.observations.sensor_timestamp_ns
+    if len(stamps) < 2 and result.imu is not None:
+        stamps = result.imu.t_ns
+    known = axis.s(stamps)
     span = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
     events = Events(
         dropouts_s=axis.s(figures.dropouts_ns),

@@ -164,17 +164,16 @@ def inertial_chart(result: RunResult, figures: KeyFigures) -> Chart | None:
         return None
     axis = TimeAxis.of(result)
     t_s = axis.s(imu.t_ns - imu_minus_camera_ns(result))
-    chart = panel_grid(3, 2, height_in=5.0, legend=True, titles=True)
-    for k, (title, values, unit) in enumerate(
-        (("Specific force", imu.acc_mps2, "m/s2"), ("Angular rate", np.rad2deg(imu.gyro_radps), "deg/s"))
+    chart = panel_grid(3, 2, height_in=4.6, legend=True)
+    for k, (what, values, unit) in enumerate(
+        (("force", imu.acc_mps2, "m/s²"), ("rate", np.rad2deg(imu.gyro_radps), "deg/s"))
     ):
-        chart.panels[0][k].title = f"{title}, brick axes"
         chart.panels[-1][k].x_label = axis.label
         for i in range(3):
             panel = chart.panels[i][k]
             mark_events(panel, axis, result, figures)
             panel.add(line(t_s, values[:, i], colour=FUSED, width_pt=0.9, label="inertial sensor"))
-            panel.y_label = f"{'xyz'[i]}, {unit}"
+            panel.y_label = f"{what} {'xyz'[i]}, {unit}"
     return chart
 
 

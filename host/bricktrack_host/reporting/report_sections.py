@@ -122,8 +122,8 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
             embed_chart(
                 inertial,
                 "Specific force and angular rate over time",
-                "What the inertial sensor measured, gravity and bias included. Interrupted where samples are "
-                "missing or rejected.",
+                "Specific force and angular rate as the inertial sensor measured them, in brick axes, with "
+                "gravity and bias. Interrupted where samples are missing or rejected.",
             )
         )
     spectrum = spectrum_chart(result)
