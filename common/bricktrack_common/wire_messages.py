@@ -399,3 +399,8 @@ def _explained(error: ProtocolError, minor: int) -> ProtocolError:
         f"{error}. The message is of protocol {PROTOCOL_VERSION}.{minor}, this bricktrack speaks "
         f"{PROTOCOL_VERSION}.{PROTOCOL_MINOR}: upgrade it"
     )
+
+
+# msgspec prepares a type when it is first used, and crashes where several threads do that at once: not later.
+for _envelope in (_RequestEnvelope, _ReplyEnvelope):
+    msgspec.msgpack.Decoder(_envelope)
