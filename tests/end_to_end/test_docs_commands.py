@@ -1,6 +1,7 @@
 """What the documentation tells to type is what the programs take: commands, options, values, and Python names."""
 
 import ast
+import doctest
 import importlib
 import re
 import shlex
@@ -235,3 +236,36 @@ def test_python_on_a_page_is_python_and_names_what_exists(page, code):
             for alias in node.names:
                 if alias.name.startswith("bricktrack"):
                     importlib.import_module(alias.name)
+
+
+def _source_text() -> str:
+    """Return the programs' source with strings that stand one below the other joined, as they are printed."""
+    files = [
+        p
+        for side in ("common/bricktrack_common", "device/bricktrack_device", "host/bricktrack_host")
+        for p in sorted((ROOT / side).rglob("*.py"))
+    ]
+    return re.sub(r"\"\s*\n\s*f?\"", "", "\n".join(p.read_text() for p in files))
+
+
+def test_messages_in_troubleshooting_are_ones_the_programs_print():
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    source = _source_text()
+    said = re.findall(r"^\| `([^`]+)`", page, flags=re.M)
+    assert len(said) > 20
+    pieces = [piece.strip() for words in said for piece in words.split("...") if piece.strip()]
+    never = [piece for piece in pieces if piece not in source]
+    assert not never, "\n".join(never)
+
+
+def test_what_a_session_on_a_page_prints_is_what_the_code_prints():
+    n_tried = 0
+    for page in PAGES:
+        for fence in _FENCE.finditer(page.read_text()):
+            if fence[3].strip() == "pycon":
+                name = str(page.relative_to(ROOT))
+                session = doctest.DocTestParser().get_doctest(fence[4], {}, name, name, 0)
+                failed, tried = doctest.DocTestRunner(verbose=False).run(session)
+                assert not failed, name
+                n_tried += tried
+    assert n_tried
