@@ -148,7 +148,7 @@ class ControlPage:
         self._grid.on(
             "selectionChanged",
             self._selection_changed,
-            js_handler="(e) => emit(e.api.getSelectedRows().map(row => row.name))",
+            js_handler=f"() => emit(getElement({self._grid.id}).api.getSelectedRows().map(row => row.name))",
         )
 
     def _refresh(self) -> None:
