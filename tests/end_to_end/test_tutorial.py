@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -21,15 +22,17 @@ def commands_of(page: str) -> list[str]:
 
 
 def run_page(name: str, folder: Path) -> list[str]:
-    """Run a tutorial's commands in a folder that sees the repository's tests; return what each printed."""
-    (folder / "tests").symlink_to(ROOT / "tests")
+    """Run a tutorial's commands in a folder, with the files that it shows; return what each printed."""
     environment = os.environ | {
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "COLUMNS": "140",
         "NO_COLOR": "1",
     }
+    page = (TUTORIALS / name).read_text()
+    for file, text in re.findall(r"```toml\n# (\S+)\n(.*?)```", page, flags=re.S):
+        (folder / file).write_text(text)
     outputs = []
-    for command in commands_of((TUTORIALS / name).read_text()):
+    for command in commands_of(page):
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", command],
             cwd=folder,
@@ -45,6 +48,7 @@ def run_page(name: str, folder: Path) -> list[str]:
 
 @pytest.mark.slow
 def test_every_command_of_the_first_recording_works(tmp_path):
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
     outputs = run_page("first-recording.md", tmp_path)
     assert len(outputs) >= 4
     # The last command prints the errors against truth, marked as simulated.
@@ -54,9 +58,24 @@ def test_every_command_of_the_first_recording_works(tmp_path):
 
 @pytest.mark.slow
 def test_the_calibration_holds_and_a_turned_lens_is_told(tmp_path):
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
     _, fitted, held, turned = run_page("calibrate-a-unit.md", tmp_path)
     assert "Calibration of unit sample" in fitted
     assert (tmp_path / "maps" / "coverage.png").exists()
     assert "The calibration holds." in held
     # The rig's own depth (rig.toml), found although the command line says 103 mm.
     assert "101.12 mm, not 103 mm" in " ".join(turned.split())
+
+
+@pytest.mark.slow
+def test_a_test_day_with_a_simulated_unit_ends_in_a_report(tmp_path):
+    try:
+        outputs = run_page("test-day.md", tmp_path)
+    except BaseException:
+        if (tmp_path / "unit.pid").exists():
+            os.kill(int((tmp_path / "unit.pid").read_text()), signal.SIGTERM)
+        raise
+    assert "1 of 1 units are ready" in outputs[5]
+    assert "Errors against simulated truth" in outputs[7]
+    assert (tmp_path / "stills" / "b7-1_leds.png").exists()
+    assert (tmp_path / "tests" / "shake-12" / "combined" / "report.html").exists()
