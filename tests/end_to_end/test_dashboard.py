@@ -167,6 +167,15 @@ def test_units_touched_are_armed_and_disarmed_and_say_so(page, lab):
     expect(states(page, "armed")).to_have_count(0)
 
 
+def test_all_units_are_disarmed_only_after_asking(page):
+    page.get_by_role("button", name="Disarm").click()
+    expect(page.get_by_text(f"Disarm all {N_LIGHT + 3} units?")).to_be_visible()
+    before = page.locator(".order-words").all_text_contents()
+    page.get_by_role("button", name="Keep them").click()
+    expect(page.get_by_text(f"Disarm all {N_LIGHT + 3} units?")).to_be_hidden()
+    assert page.locator(".order-words").all_text_contents() == before
+
+
 def test_a_unit_that_does_not_do_as_told_is_named(page):
     page.locator('.unit[data-unit="gone"]').tap()
     expect(page.get_by_text("Orders go to gone alone")).to_be_visible()

@@ -68,7 +68,7 @@ class ControlPage:
             self._chips = ui.row().classes("bar")
             ui.space()
             self._arm_button = ui.button("Arm", icon="sensors", on_click=self._open_arm)
-            self._disarm_button = ui.button("Disarm", icon="stop", on_click=self._disarm).props(
+            self._disarm_button = ui.button("Disarm", icon="stop", on_click=self._disarm_meant).props(
                 "color=grey-8"
             )
             self._pull_button = ui.button("Pull runs", icon="download", on_click=self._pull)
@@ -91,6 +91,12 @@ class ControlPage:
             with ui.row():
                 ui.button("Arm", on_click=self._arm)
                 ui.button("Cancel", on_click=self._arm_dialog.close).props("flat")
+
+        with ui.dialog() as self._disarm_dialog, ui.card():
+            ui.label(f"Disarm all {len(self._units)} units?").classes("big")
+            with ui.row():
+                ui.button("Disarm all", on_click=self._disarm)
+                ui.button("Keep them", on_click=self._disarm_dialog.close).props("flat")
 
     def _build_tabs(self, tests_folder: Path | None) -> None:
         with ui.tabs().props("dense align=left inline-label").classes("wide") as tabs:
@@ -260,7 +266,15 @@ class ControlPage:
             lambda: self._desk.arm(self._meant(), (self._label.value or "").strip(), duration_s)
         )
 
+    async def _disarm_meant(self) -> None:
+        """Disarm the units chosen; all of them only after asking, as it ends a test that waits."""
+        if self._chosen:
+            await self._disarm()
+        else:
+            self._disarm_dialog.open()
+
     async def _disarm(self) -> None:
+        self._disarm_dialog.close()
         await self._order(lambda: self._desk.disarm(self._meant()))
 
     async def _pull(self) -> None:
