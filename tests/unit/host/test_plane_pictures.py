@@ -43,7 +43,9 @@ def test_shifted_and_turned_boards_become_one():
 
 def test_boards_that_do_not_belong_together_are_refused():
     here, there = placed(BoardPose((-30, 0, 110))), placed(BoardPose((38, 0, 110)))
-    with pytest.raises(CalibrationError, match=r"board 2 of 2: \d+ of its dots lie among those of the others"):
+    with pytest.raises(
+        CalibrationError, match=r"board 2 of 2: \d+ of its dots lie among those of the others"
+    ):
         merge_boards([here, there])
     nearer = placed(BoardPose((5, 0, 107.0)))
     with pytest.raises(CalibrationError, match="2 boards disagree by .* um where they overlap"):
