@@ -31,6 +31,7 @@ from bricktrack_host.calibration.calibration_file import (
     require_match,
 )
 from bricktrack_host.fusion.estimate import FusionResult, fuse
+from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
@@ -62,6 +63,7 @@ from bricktrack_host.tracking.optical_track import (
 )
 from bricktrack_host.tracking.segment import Picture, Plane
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
+from bricktrack_host.transfer.fleet_config import CameraMount
 
 logger = logging.getLogger(__name__)
 
@@ -87,6 +89,9 @@ class ProcessSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         Name of the inertial sensor on the LED component; `None`: the run's first.
     use_imu : bool
         False: smooth the optical poses alone.
+    camera : "static", "imu" or "table"
+        What the camera moves with. Unless it is static the poses are smoothed alone: one sensor on the LED
+        component cannot tell the camera's acceleration from the brick's.
     max_clock_offset_s : float
         How far apart the stamps of camera and IMU may be: recordings made elsewhere have clocks of their own.
     """
@@ -96,6 +101,7 @@ class ProcessSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     rolling_shutter: bool = True
     imu: str | None = None
     use_imu: bool = True
+    camera: CameraMount = "static"
     max_clock_offset_s: float = 0.25
 
 
@@ -350,6 +356,11 @@ def _choose_imu(
 ) -> ImuTrack | None:
     """Return the samples of the sensor on the LED component in brick axes, or `None` and why."""
     if not settings.use_imu:
+        return None
+    if settings.camera != "static":
+        problems.append(
+            f"the camera moves (camera = {settings.camera!r}): optical poses alone. {NOT_OBSERVABLE}"
+        )
         return None
     if settings.imu is not None and settings.imu not in run.imus:
         raise ConfigError(f"the run has no IMU '{settings.imu}'; it has: {', '.join(run.imus) or 'none'}")

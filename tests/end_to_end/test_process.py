@@ -10,12 +10,14 @@ import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError, ConfigError, RunFormatError, TrackingError, VideoError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest, write_manifest
 from bricktrack_host.calibration.calibration_file import load_calibration, save_calibration
 from bricktrack_host.cli import calibrate
+from bricktrack_host.cli.main import app
 from bricktrack_host.pipeline import ProcessSettings, process_run
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.recordings.import_recording import Recording, import_recording
@@ -239,3 +241,30 @@ def test_a_film_of_another_runs_results_is_refused(processed, bench, tmp_path):
     with pytest.raises(RunFormatError, match="not of this run"):
         write_overlay(other, processed.folder, tmp_path / "film.mp4")
     assert not (tmp_path / "film.mp4").exists()
+
+
+@pytest.mark.parametrize("camera", ["imu", "table"])
+def test_a_moving_camera_is_not_fused_as_if_it_stood_still(bench, tmp_path, camera):
+    moving = process_run(
+        bench / "runs" / "sample_motion",
+        calibration=bench / "calibration.json",
+        layout=LAYOUT,
+        output=tmp_path / "moving",
+        settings=ProcessSettings(camera=camera),
+    )
+    assert any("the position is not observable" in problem for problem in moving.result.problems)
+    for track in moving.result.fused.values():
+        assert (track.flags & PoseFlag.OPTICAL_ONLY).all()
+
+
+def test_the_fleet_file_says_what_the_camera_moves_with(bench, tmp_path):
+    (tmp_path / "fleet.toml").write_text(
+        f'[[unit]]\nname = "sample"\naddress = "tcp://127.0.0.1:9"\ncamera = "table"\nlayout = "{LAYOUT}"\n'
+        f'calibration = "{bench / "calibration.json"}"\n'
+    )
+    run = bench / "runs" / "sample_motion"
+    done = CliRunner().invoke(
+        app, ["process", str(run), "--fleet", str(tmp_path / "fleet.toml"), "-o", str(tmp_path / "out")]
+    )
+    assert done.exit_code == 0, done.output
+    assert "the position is not observable" in " ".join(done.output.split())

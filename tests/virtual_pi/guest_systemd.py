@@ -114,10 +114,10 @@ def manager():
         for node in Path("/dev").glob(pattern):
             shutil.chown(node, group=group)
             node.chmod(0o660)
-    # What differs from a unit: a Python that may live in a home, and a board that is told by a file.
+    # What differs from a unit: a Python that may live in a home or in /tmp, and a board that is told by a file.
     shutil.copy("/proc/cpuinfo", BOARD)
     binds = [f"{BOARD}:/proc/cpuinfo"]
-    binds += [p for p in (sys.base_prefix, str(REPOSITORY)) if p.startswith(("/root/", "/home/"))]
+    binds += [p for p in (sys.base_prefix, str(REPOSITORY)) if p.startswith(("/root/", "/home/", "/tmp/"))]
     DROP_IN.parent.mkdir()
     DROP_IN.write_text(f"[Service]\nProtectHome=tmpfs\nBindReadOnlyPaths={' '.join(binds)}\n")
     made = Manager()

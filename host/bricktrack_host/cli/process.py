@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import msgspec
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -14,8 +16,8 @@ from bricktrack_common.errors import BricktrackError, ConfigError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.cli._console import err, out, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
-from bricktrack_host.cli._units import DEFAULT_FLEET, FleetOption
-from bricktrack_host.transfer.fleet_config import UnitConfig, load_fleet
+from bricktrack_host.cli._units import FleetOption, fleet_path
+from bricktrack_host.transfer.fleet_config import CameraMount, UnitConfig, load_fleet
 from bricktrack_host.transfer.pull import PulledRun
 
 # What computes is imported by the command that runs it: OpenCV, SciPy, PyArrow and matplotlib take seconds
@@ -38,6 +40,15 @@ TruthOption = Annotated[
     Path | None,
     typer.Option("--truth", help="True motion of a simulated run: a file, or a folder that holds one."),
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Belongings:
+    """What belongs to a run's unit."""
+
+    calibration: Path
+    layout: Path
+    camera: CameraMount
 
 
 class _StageBar:
@@ -99,6 +110,13 @@ def process(
     use_imu: Annotated[
         bool, typer.Option("--use-imu/--no-imu", help="Fuse with the IMU, or smooth the optical poses alone.")
     ] = True,
+    camera: Annotated[
+        CameraMount | None,
+        typer.Option(
+            help="What the camera moves with; unless static, optical poses alone. "
+            "\\[default: the fleet file's, else static]"
+        ),
+    ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -133,13 +151,16 @@ def process(
     )
     wanted = partial(_process_one, output=output, settings=settings, truth=truth)
     if len(runs) == 1:
-        files = _files_for(runs[0], calibration, layout, fleet)
+        files = _belongings(runs[0], calibration, layout, camera, fleet)
         with stage_bar(runs[0].name) as bar:
             processed = wanted(runs[0], files, bar)
         say_processed(processed)
         return
     failed = _process_all(
-        runs, partial(_files_for, calibration=calibration, layout=layout, fleet_file=fleet), wanted, jobs
+        runs,
+        partial(_belongings, calibration=calibration, layout=layout, camera=camera, fleet_file=fleet),
+        wanted,
+        jobs,
     )
     if failed:
         say_error(f"{failed} of {len(runs)} runs could not be processed")
@@ -152,17 +173,17 @@ def process_folders(runs: list[Path], *, fleet: Path, jobs: int | None) -> int:
 
     wanted = partial(_process_one, output=None, settings=ProcessSettings(), truth=None)
     return _process_all(
-        runs, partial(_files_for, calibration=None, layout=None, fleet_file=fleet), wanted, jobs
+        runs, partial(_belongings, calibration=None, layout=None, camera=None, fleet_file=fleet), wanted, jobs
     )
 
 
 def _process_all(
     runs: list[Path],
-    files_for: "Callable[[Path], tuple[Path, Path]]",
+    files_for: Callable[[Path], _Belongings],
     wanted: "Callable[..., ProcessedRun]",
     jobs: int | None,
 ) -> int:
-    ready: list[tuple[Path, tuple[Path, Path]]] = []
+    ready: list[tuple[Path, _Belongings]] = []
     for run in runs:
         try:
             ready.append((run, files_for(run)))
@@ -173,7 +194,7 @@ def _process_all(
 
 def _process_one(
     run: Path,
-    files: tuple[Path, Path],
+    files: _Belongings,
     progress: "ProcessProgress",
     *,
     output: Path | None,
@@ -183,13 +204,13 @@ def _process_one(
     from bricktrack_host.pipeline import process_run
 
     return process_run(
-        run, calibration=files[0], layout=files[1], output=output, settings=settings, truth=truth,
-        progress=progress,
+        run, calibration=files.calibration, layout=files.layout, output=output,
+        settings=msgspec.structs.replace(settings, camera=files.camera), truth=truth, progress=progress,
     )  # fmt: skip
 
 
 def _process_many(
-    ready: list[tuple[Path, tuple[Path, Path]]], wanted: "Callable[..., ProcessedRun]", jobs: int | None
+    ready: list[tuple[Path, _Belongings]], wanted: "Callable[..., ProcessedRun]", jobs: int | None
 ) -> int:
     """Process runs side by side, say what became of each as it ends, and return how many failed."""
     from bricktrack_host.many_runs import default_workers, process_side_by_side
@@ -222,33 +243,35 @@ def _process_many(
 
 def process_pulled(unit: UnitConfig, pulled: PulledRun) -> None:
     """Process one run that was just pulled, with the calibration and layout that the fleet file names."""
-    from bricktrack_host.pipeline import process_run
+    from bricktrack_host.pipeline import ProcessSettings, process_run
 
     if unit.calibration_path is None or unit.layout_path is None:
         raise ConfigError(
             f"fleet.toml names no calibration or no layout for unit '{unit.name}'. Add them, or "
             f"process by hand: bricktrack process {pulled.folder} --calibration FILE --layout FILE"
         )
-    if unit.camera != "static":
-        raise ConfigError(
-            f"unit '{unit.name}': camera = \"{unit.camera}\" in fleet.toml: with a moving camera and one "
-            "inertial sensor on the LEDs' side, the position cannot be told from the camera's own motion. "
-            "Process its optical poses alone: bricktrack process RUN --no-imu"
-        )
     with stage_bar(pulled.run_id) as bar:
         processed = process_run(
-            pulled.folder, calibration=unit.calibration_path, layout=unit.layout_path, progress=bar
+            pulled.folder,
+            calibration=unit.calibration_path,
+            layout=unit.layout_path,
+            settings=ProcessSettings(camera=unit.camera),
+            progress=bar,
         )
     say_processed(processed)
 
 
-def _files_for(
-    run: Path, calibration: Path | None, layout: Path | None, fleet_file: Path | None
-) -> tuple[Path, Path]:
-    """Return the calibration and layout that the options name, or else the fleet file for the run's unit."""
-    if calibration is not None and layout is not None:
-        return calibration, layout
-    path = fleet_file or DEFAULT_FLEET
+def _belongings(
+    run: Path,
+    calibration: Path | None,
+    layout: Path | None,
+    camera: CameraMount | None,
+    fleet_file: Path | None,
+) -> _Belongings:
+    """Return what the options name, or else the fleet file for the run's unit."""
+    if fleet_file is None and calibration is not None and layout is not None:
+        return _Belongings(calibration, layout, camera or "static")
+    path = fleet_path(fleet_file)
     if fleet_file is None and not path.exists():
         raise ConfigError("give --calibration and --layout, or a fleet file that names them for the unit")
     unit = load_fleet(path).select([read_manifest(run / MANIFEST_NAME).unit])[0]
@@ -257,7 +280,7 @@ def _files_for(
         raise ConfigError(
             f"{path}: unit '{unit.name}' has no {'calibration' if found[0] is None else 'layout'}"
         )
-    return found[0], found[1]
+    return _Belongings(found[0], found[1], camera or unit.camera)
 
 
 def say_processed(processed: "ProcessedRun", *, budget: bool = True) -> None:

@@ -25,7 +25,7 @@ _ALIGNED_NS = 2e4  # offsets that moved less are settled: 6 um at 0.3 m/s
 NOT_OBSERVABLE = (
     "When the camera moves, one IMU on the LED component cannot tell the camera's acceleration from the "
     "brick's: the position is not observable. Mount a second IMU with the camera, or smooth the optical "
-    "poses alone (smooth_optical)."
+    "poses alone."
 )
 
 

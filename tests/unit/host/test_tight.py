@@ -42,7 +42,9 @@ def normalised(run, track):
 
 
 @pytest.mark.slow
-def test_error_is_at_most_half_of_the_pose_level_ones_at_full_speed():
+def test_at_full_speed_the_error_stays_well_below_the_pose_level_one():
+    # Poses whose twist was held constant within a frame gave 0.30 mm here, four times ours; with a twist that may
+    # change (0.12 mm) what is left to gain is the dropouts and the frames with few LEDs.
     tight, poses, covered, speeds = [], [], [], []
     for seed in (13, 15):
         run = simulate_run(
@@ -55,7 +57,8 @@ def test_error_is_at_most_half_of_the_pose_level_ones_at_full_speed():
         covered.append((normalised(run, result.fused.track) < 12.59).mean())
         speeds.append(np.linalg.norm(run.world.twist(result.fused.track.t_ns)[1], axis=1).max())
     assert min(speeds) > 300
-    assert rms(*tight) < 0.5 * rms(*poses)
+    assert rms(*tight) < 0.7 * rms(*poses)
+    assert rms(*tight) < 0.09
     assert np.mean(covered) > 0.93
 
 
