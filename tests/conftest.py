@@ -1,8 +1,13 @@
 """For all tests: small matrices are not spread over threads, which slows them many times on a busy machine."""
 
 import os
+import signal
 
 import pytest
+
+# A shell's background job ignores Ctrl-C, and hands that on to the programs that tests interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it once, when it is loaded
 

@@ -106,13 +106,17 @@ def test_a_clipped_accelerometer_is_flagged_where_its_registers_are_at_the_limit
     flags = run.imus["brick"][1].flags
     # 100 counts are 1 m/s2 (data sheet, table 3-17): 16 g are 15,691 counts.
     first = records[0].slot
-    at_limit = {
-        r.slot - first
+    largest = {
+        r.slot - first: np.abs(np.frombuffer(r.data[:6], dtype="<i2").astype(int)).max()
         for r in records
-        if r.data is not None and np.abs(np.frombuffer(r.data[:6], dtype="<i2").astype(int)).max() >= 15_600
+        if r.data is not None
     }
+    at_limit = {slot for slot, counts in largest.items() if counts >= 15_690}
+    near_limit = {
+        slot for slot, counts in largest.items() if counts >= 15_500
+    }  # a sample may just not be clipped
     flagged = set(np.flatnonzero(flags & ImuFlag.ACC_CLIPPED).tolist())
-    assert at_limit and flagged == at_limit
+    assert at_limit and at_limit <= flagged <= near_limit
     assert run.manifest.quality.imu_clipped == len(flagged)
 
 
