@@ -1,6 +1,5 @@
 """The report of a calibration: one HTML file without other files, and its figures as pictures."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +18,12 @@ from bricktrack_host.calibration.pixel_polynomials import picture_grid
 from bricktrack_host.calibration.ray_calibration import RayCalibration
 from bricktrack_host.calibration.ray_uncertainty import CHI_95
 from bricktrack_host.reporting.calibration_sections import CalibrationEvidence, calibration_sections
+from bricktrack_host.reporting.page import Key, OriginTable
 from bricktrack_host.reporting.plots import style
 
 WARN_BELOW_COVERED = 0.8
 """Whole dots that fill the picture surround some 85 % of it: up to a pitch is lost all round."""
 _PNG_DPI = 160
-
-
-@dataclass(frozen=True, slots=True)
-class _Key:
-    name: str
-    value: str
-    note: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class _OriginTable:
-    title: str
-    rows: list[tuple[str, str]]
-    mono: bool
 
 
 def write_calibration_report(
@@ -161,7 +147,7 @@ def _rendered(evidence: CalibrationEvidence, sections: list[Any]) -> str:
     )
 
 
-def _key_figures(evidence: CalibrationEvidence) -> list[_Key]:
+def _key_figures(evidence: CalibrationEvidence) -> list[Key]:
     fitted, model = evidence.fitted, evidence.fitted.model
     choice = fitted.choice
     chosen = next(
@@ -173,25 +159,25 @@ def _key_figures(evidence: CalibrationEvidence) -> list[_Key]:
     middle = (model.plane_a_mm + model.plane_b_mm) / 2
     sd_um = 1e3 * CHI_95 * model.point_sd_mm(uv, middle)
     keys = [
-        _Key("Model", choice.model, f"{'degrees held up to' if choice.held else 'order'} {choice.order}"),
-        _Key("Mean residual", " · ".join(f"{r.mean_um:.2f}" for r in model.residuals) + " um", "each plane"),
-        _Key("Maximum residual", " · ".join(f"{r.max_um:.1f}" for r in model.residuals) + " um",
+        Key("Model", choice.model, f"{'degrees held up to' if choice.held else 'order'} {choice.order}"),
+        Key("Mean residual", " · ".join(f"{r.mean_um:.2f}" for r in model.residuals) + " um", "each plane"),
+        Key("Maximum residual", " · ".join(f"{r.max_um:.1f}" for r in model.residuals) + " um",
              "each plane"),
-        _Key("Dots", " · ".join(str(r.n_dots) for r in model.residuals),
+        Key("Dots", " · ".join(str(r.n_dots) for r in model.residuals),
              f"{sum(fitted.n_left_out)} left out as contradicting"),
-        _Key("Error at left-out dots", f"{chosen.rms_um:.2f} um", f"rms; {chosen.max_um:.1f} um at most"),
-        _Key("Picture covered", f"{evidence.covered_share:.0%}", "by dots around"),
-        _Key("Rays known to", f"{np.median(sd_um[model.is_covered(uv)]):.2f} um",
+        Key("Error at left-out dots", f"{chosen.rms_um:.2f} um", f"rms; {chosen.max_um:.1f} um at most"),
+        Key("Picture covered", f"{evidence.covered_share:.0%}", "by dots around"),
+        Key("Rays known to", f"{np.median(sd_um[model.is_covered(uv)]):.2f} um",
              "95 %, median where covered, midway"),
     ]  # fmt: skip
     if evidence.leds is not None:
         inside = evidence.leds.contains(uv)
         if inside.any():
-            keys.append(_Key("... at the LEDs", f"{sd_um[inside].max():.2f} um", "95 %, at most, midway"))
+            keys.append(Key("... at the LEDs", f"{sd_um[inside].max():.2f} um", "95 %, at most, midway"))
     return keys
 
 
-def _origin_tables(calibration: Calibration) -> list[_OriginTable]:
+def _origin_tables(calibration: Calibration) -> list[OriginTable]:
     mode = calibration.sensor_mode
     images = [
         (f"{image.name}, z = {image.z_mm:g} mm, {image.n_dots_found} dots", image.sha256)
@@ -206,8 +192,8 @@ def _origin_tables(calibration: Calibration) -> list[_OriginTable]:
         ("target", f"{t.columns} x {t.rows} dots of {t.dot_diameter_mm:.3f} mm, {t.pitch_mm:g} mm apart"),
     ]
     return [
-        _OriginTable("Pictures, SHA-256", images, True),
-        _OriginTable("How it was made", made, False),
+        OriginTable("Pictures, SHA-256", images, True),
+        OriginTable("How it was made", made, False),
     ]
 
 
