@@ -30,6 +30,7 @@ from bricktrack_host.results.result_store import (
     Details,
     Provenance,
     RunResult,
+    read_parquet,
     read_result,
     software_version,
 )
@@ -241,10 +242,7 @@ def read_components(folder: Path, assembly: str) -> "pa.Table":
     table_name = entries[assembly].table
     if table_name is None:
         raise RunFormatError(f"{folder}: {assembly}: no motion: {'; '.join(entries[assembly].problems)}")
-    try:
-        return pa.parquet.read_table(folder / table_name)
-    except (OSError, pa.ArrowException) as e:
-        raise RunFormatError(f"{folder / table_name}: not a readable Parquet table: {e}") from e
+    return read_parquet(folder / table_name)
 
 
 def component_table(

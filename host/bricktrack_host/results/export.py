@@ -12,6 +12,7 @@ import scipy.io
 
 from bricktrack_common.errors import RunFormatError
 from bricktrack_host.durable_files import rename_durably, storage_errors, sync_file
+from bricktrack_host.results.result_store import read_parquet
 
 Format = Literal["csv", "mat", "parquet"]
 _MAT_NAME_MAX = 63  # of MATLAB; savemat cuts longer field names off at 31 unless told
@@ -37,10 +38,7 @@ def read_run_table(results: Path, table: str) -> "pa.Table":
     path = results / f"{name}.parquet"
     if not path.is_file():
         raise RunFormatError(f"{path}: no such table. Is the run processed, and has it any {name}?")
-    try:
-        whole = pa.parquet.read_table(path)
-    except (OSError, pa.ArrowException) as e:
-        raise RunFormatError(f"{path}: not a readable Parquet table: {e}") from e
+    whole = read_parquet(path)
     if table != "samples":
         return whole
     kind = np.array(whole.column("kind").to_pylist(), dtype=object)

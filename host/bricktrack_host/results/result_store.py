@@ -287,15 +287,20 @@ def read_result(folder: Path) -> RunResult:
 
 
 def _read_table(path: Path, n_rows: int) -> Any:
-    try:
-        table = pa.parquet.read_table(path)
-    except FileNotFoundError as e:
-        raise RunFormatError(f"{path}: missing. Process the run again") from e
-    except (OSError, pa.ArrowException) as e:
-        raise RunFormatError(f"{path}: not a readable Parquet table: {e}") from e
+    if not path.is_file():
+        raise RunFormatError(f"{path}: missing. Process the run again")
+    table = read_parquet(path)
     if table.num_rows != n_rows:
         raise RunFormatError(f"{path}: {table.num_rows} rows; the summary says {n_rows}")
     return table
+
+
+def read_parquet(path: Path) -> "pa.Table":
+    """Return one table; raise `RunFormatError` where it cannot be read."""
+    try:
+        return pa.parquet.read_table(path)
+    except (OSError, pa.ArrowException) as e:
+        raise RunFormatError(f"{path}: not a readable Parquet table: {e}") from e
 
 
 def _table_metadata(result: RunResult) -> dict[str, str]:
