@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -18,7 +17,7 @@ from bricktrack_host.calibration.pixel_polynomials import picture_grid
 from bricktrack_host.calibration.ray_calibration import RayCalibration
 from bricktrack_host.calibration.ray_uncertainty import CHI_95
 from bricktrack_host.reporting.calibration_sections import CalibrationEvidence, calibration_sections
-from bricktrack_host.reporting.page import Key, OriginTable
+from bricktrack_host.reporting.page import Key, OriginTable, page_environment
 from bricktrack_host.reporting.plots import style
 
 WARN_BELOW_COVERED = 0.8
@@ -123,27 +122,24 @@ def verdict(evidence: CalibrationEvidence) -> tuple[str, list[str]]:
 def _rendered(evidence: CalibrationEvidence, sections: list[Any]) -> str:
     calibration = evidence.calibration
     line, problems = verdict(evidence)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("bricktrack_host.reporting"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html.j2").render(
-        run_id=f"Calibration of {calibration.unit}",
-        unit=calibration.unit,
-        label=calibration.focus_note,
-        simulated=calibration.simulated,
-        date=calibration.created_utc.strftime("%d %B %Y, %H:%M:%S UTC").lstrip("0"),
-        provenance={"software_version": calibration.software.removeprefix("bricktrack ")},
-        verdict=line,
-        mood="care" if problems else "good",
-        problems=problems,
-        key=_key_figures(evidence),
-        sections=sections,
-        flag_tables=[],
-        origin_tables=_origin_tables(calibration),
+    return (
+        page_environment()
+        .get_template("report.html.j2")
+        .render(
+            run_id=f"Calibration of {calibration.unit}",
+            unit=calibration.unit,
+            label=calibration.focus_note,
+            simulated=calibration.simulated,
+            date=calibration.created_utc.strftime("%d %B %Y, %H:%M:%S UTC").lstrip("0"),
+            provenance={"software_version": calibration.software.removeprefix("bricktrack ")},
+            verdict=line,
+            mood="care" if problems else "good",
+            problems=problems,
+            key=_key_figures(evidence),
+            sections=sections,
+            flag_tables=[],
+            origin_tables=_origin_tables(calibration),
+        )
     )
 
 
