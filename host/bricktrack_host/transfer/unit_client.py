@@ -364,6 +364,7 @@ class UnitClient:
             if len(rest) not in _frames_allowed(reply):
                 self.counts.foreign_messages += 1
                 continue
+            self._handshake.close()  # it is over, and its sockets are wanted by the next of many units
             return request_id, reply, rest[0] if len(rest) == 1 else b"".join(rest)
 
     def _wait_for(self, event: int, deadline_s: float, problem: str) -> None:

@@ -1,7 +1,10 @@
 """The protocol client against a unit in a thread that keeps to the protocol, and one that does not."""
 
+import contextlib
+import sys
 import threading
 import time
+from pathlib import Path
 
 import msgpack
 import pytest
@@ -307,3 +310,22 @@ def test_many_clients_of_one_context_leave_no_socket_behind(runs):
         ):
             client.hello()
     context.term()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts open files in /proc")
+def test_the_handshakes_sockets_are_given_back_after_the_first_answer(runs):
+    def n_open():
+        return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+    n_clients = 8
+    with FakeUnit(runs) as unit, zmq.Context() as context, contextlib.ExitStack() as opened:
+        with UnitClient(unit.address, context=context) as warming:
+            warming.hello()  # the context's own threads and files are there from now on
+        n_before = n_open()
+        for _ in range(n_clients):
+            opened.enter_context(UnitClient(unit.address, context=context)).hello()
+        deadline_s = time.monotonic() + 5.0  # ZeroMQ closes sockets in a thread of its own
+        # Each keeps its own socket and both ends of its connection; two more would be the watch's.
+        while n_open() > n_before + 3 * n_clients and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        assert n_open() <= n_before + 3 * n_clients
