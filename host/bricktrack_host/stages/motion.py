@@ -1,0 +1,165 @@
+"""The stage of the motion: the instants wanted, frames and inertial samples together, and what fell out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.errors import ShapeError, TrackingError
+from bricktrack_host.fusion.estimate import FusionResult, fuse
+from bricktrack_host.fusion.optical_smoothing import smooth_optical
+from bricktrack_host.fusion.tight import fuse_tight
+from bricktrack_host.fusion.time_alignment import TimeAlignment
+from bricktrack_host.results.daq_clock import EdgeFit
+from bricktrack_host.results.result_tables import FusedKind
+from bricktrack_host.tracking.first_poses import FirstPoses
+from bricktrack_host.tracking.optical_track import led_motion, solve_poses
+from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
+
+_RETIME_PASSES = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OutputGrid:
+    """The instants at which the motion is wanted, camera time, by kind."""
+
+    t_ns: dict[FusedKind, IntArray]
+    edge_index: IntArray
+
+
+def output_grid(
+    optical: OpticalTrack, imu: ImuTrack | None, alignment: TimeAlignment | None, edge_fit: EdgeFit | None
+) -> OutputGrid:
+    """Return every IMU slot, frame and sample of the square wave from the first frame to the last."""
+    first, last = int(optical.t_ns[0]), int(optical.t_ns[-1])
+    t_ns: dict[FusedKind, IntArray] = {}
+    if imu is not None and alignment is not None:
+        # The stamps are IMU time; the offset's own change over it (skew x offset) is below a nanosecond.
+        shift_ns = alignment.imu_time_ns(imu.t_ns) - imu.t_ns
+        slots = imu.t_ns - shift_ns
+        t_ns["imu"] = slots[(slots >= first) & (slots <= last)]
+    t_ns["frame"] = optical.t_ns
+    index = np.empty(0, dtype=np.int64)
+    if edge_fit is not None:
+        index = np.arange(edge_fit.last_index + 1)
+        edges = edge_fit.time_of_index(index)
+        inside = (edges >= first) & (edges <= last)
+        index = index[inside]
+        t_ns["edge"] = edges[inside]
+    return OutputGrid(t_ns, index)
+
+
+def retime(
+    observations: LedObservations,
+    first: FirstPoses,
+    optical: OpticalTrack,
+    imu: ImuTrack | None,
+    alignment: TimeAlignment | None,
+    rays: RayModel,
+    brick: BrickModel,
+) -> OpticalTrack:
+    """Solve the poses again with each LED carried to its frame's instant by the fused motion.
+
+    Splines through 30 frames a second cannot follow a motion above 15 Hz, and read-out takes 20 ms: the IMU
+    knows what the brick did meanwhile.
+    """
+    if imu is None or alignment is None or brick.imu_lever_arm_mm is None:
+        return optical
+    n = len(optical.t_ns)
+    for _ in range(_RETIME_PASSES):
+        wanted = np.concatenate([optical.t_ns, optical.led_t_ns.ravel()])
+        try:
+            track = fuse(
+                optical, imu, lever_arm_mm=brick.imu_lever_arm_mm, output_t_ns=wanted, alignment=alignment
+            ).track
+        except (ShapeError, TrackingError):
+            return optical  # the fusion itself will say why
+        motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)))
+        optical = solve_poses(observations, rays, brick, motion=motion, first=first)
+        if not np.isfinite(optical.t_camera_brick_mm).any():
+            break
+    return optical
+
+
+def fuse_run(
+    optical: OpticalTrack,
+    imu: ImuTrack | None,
+    alignment: TimeAlignment | None,
+    brick: BrickModel,
+    grid: OutputGrid,
+    problems: list[str],
+    *,
+    seen: tuple[LedObservations, RayModel] | None,
+) -> tuple[dict[FusedKind, FusedTrack], FusionResult | None]:
+    """Return the motion at the instants wanted: LED by LED where ``seen`` is given, else pose by pose."""
+    wanted = np.concatenate(list(grid.t_ns.values()))
+    fusion = None
+    if imu is not None and alignment is not None and brick.imu_lever_arm_mm is not None:
+        try:
+            if seen is None:
+                fusion = fuse(
+                    optical, imu, lever_arm_mm=brick.imu_lever_arm_mm, output_t_ns=wanted, alignment=alignment
+                )
+            else:
+                lever_arm_mm = brick.imu_lever_arm_mm
+                fusion = _fuse_tight(
+                    optical, imu, alignment, brick, seen, wanted, problems, lever_arm_mm=lever_arm_mm
+                )
+        except (ShapeError, TrackingError) as e:
+            problems.append(f"fusion was not possible, optical poses alone: {e}")
+    if fusion is not None:
+        track = fusion.track
+        n_rejected = int(np.count_nonzero(fusion.frame_rejected))
+        if n_rejected:
+            problems.append(
+                f"{n_rejected} optical poses disagree with the IMU and their neighbours and were left out"
+            )
+    else:
+        track = smooth_optical(optical, wanted)
+    ends = np.cumsum([len(t) for t in grid.t_ns.values()])
+    parts = {
+        kind: _rows(track, slice(end - len(t), end))
+        for (kind, t), end in zip(grid.t_ns.items(), ends.tolist(), strict=True)
+    }
+    return parts, fusion
+
+
+def _fuse_tight(
+    optical: OpticalTrack,
+    imu: ImuTrack,
+    alignment: TimeAlignment,
+    brick: BrickModel,
+    seen: tuple[LedObservations, RayModel],
+    wanted: IntArray,
+    problems: list[str],
+    *,
+    lever_arm_mm: FloatArray,
+) -> FusionResult:
+    observations, rays = seen
+    tight = fuse_tight(
+        observations, optical, imu, rays, brick,
+        lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=alignment,
+    )  # fmt: skip
+    n_rejected = int(np.count_nonzero(tight.led_rejected))
+    if n_rejected:
+        problems.append(f"{n_rejected} LED centroids disagree with all the others and were left out")
+    if not tight.check.agrees:
+        problems.append(
+            f"fusion LED by LED and pose by pose are up to {tight.check.max_mm:.2f} mm apart, in "
+            f"{100 * tight.check.share_apart:.0f} % of the instants by more than their uncertainty allows"
+        )
+    return tight.fused
+
+
+def _rows(track: FusedTrack, rows: slice) -> FusedTrack:
+    return FusedTrack(
+        t_ns=track.t_ns[rows],
+        R_camera_brick=track.R_camera_brick[rows],
+        t_camera_brick_mm=track.t_camera_brick_mm[rows],
+        omega_brick_radps=track.omega_brick_radps[rows],
+        v_camera_mmps=track.v_camera_mmps[rows],
+        covariance=track.covariance[rows],
+        flags=track.flags[rows],
+    )

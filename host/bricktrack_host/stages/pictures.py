@@ -1,0 +1,106 @@
+"""The stage of the pictures: decode, find the LEDs, keep a few for the report."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.errors import VideoError
+from bricktrack_common.frame_times import FrameTimes
+from bricktrack_common.run_folder import Run
+from bricktrack_host.recordings.video_frames import decode_run_video
+from bricktrack_host.reporting.plots import FrameOverlay
+from bricktrack_host.stages.progress import ProcessProgress, Silent
+from bricktrack_host.tracking.optical_track import SegmentMethod, observe_leds
+from bricktrack_host.tracking.segment import Picture, Plane
+from bricktrack_host.tracks import LedObservations, OpticalTrack
+
+FIND = "decode and find LEDs"
+_N_OVERLAYS = 4
+
+
+def require_video(run: Run) -> FrameTimes:
+    """Return the records of the frames.
+
+    Raises
+    ------
+    VideoError
+        If there is no video, or nothing in it.
+    """
+    if run.video is None or run.frames is None or run.manifest.camera is None:
+        raise VideoError(f"{run.folder}: the run has no video with frame times; there is nothing to track")
+    if run.frames.n_frames == 0:
+        raise VideoError(f"{run.folder}: the run holds no frames")
+    return run.frames
+
+
+class RunPictures:
+    """The pictures of a run on their way to the tracker: counts the lost ones, keeps a few for the report."""
+
+    def __init__(self, run: Run, frames: FrameTimes) -> None:
+        if run.video is None:
+            raise VideoError(f"{run.folder}: the run has no video")
+        self._video = run.video
+        self._frames = frames
+        self._keep = set(np.linspace(0, frames.n_frames - 1, _N_OVERLAYS).round().astype(int).tolist())
+        self._kept: dict[int, Plane] = {}
+        self._lost: dict[str, list[int]] = {}
+
+    def stream(self) -> Iterator[tuple[int, Picture]]:
+        """Yield the pictures that can be trusted, with their place in the run."""
+        for frame in decode_run_video(self._video, self._frames):
+            if frame.picture is None:
+                self._lost.setdefault(frame.lost_because, []).append(frame.index)
+                continue
+            if frame.index in self._keep:
+                self._kept[frame.index] = frame.picture.luma.copy()
+            yield frame.index, frame.picture
+
+    def observe(
+        self, rays: RayModel, brick: BrickModel, method: SegmentMethod, progress: ProcessProgress
+    ) -> LedObservations:
+        """Return the LEDs seen in all pictures."""
+        return observe_leds(
+            self.stream(),
+            rays,
+            brick,
+            sensor_timestamp_ns=self._frames.sensor_timestamp_ns,
+            exposure_ns=self._frames.exposure_us * 1000,
+            method=method,
+            progress=progress.advance_to,
+        )
+
+    def problems(self) -> list[str]:
+        """Return what was wrong with the video, in words."""
+        return [
+            f"{len(frames)} frame{'s' if len(frames) > 1 else ''} lost (first: {frames[0]}): {reason}"
+            for reason, frames in self._lost.items()
+        ]
+
+    def overlays(self, observations: LedObservations, optical: OpticalTrack) -> list[FrameOverlay]:
+        """Return the kept frames with the LEDs as seen and as the pose predicts them."""
+        out = []
+        for i, luma in self._kept.items():
+            predicted = observations.uv_px[i] - optical.residual_px[i]
+            seconds = (optical.t_ns[i] - optical.t_ns[0]) / 1e9
+            out.append(FrameOverlay(f"frame {i}, {seconds:.2f} s", luma, observations.uv_px[i], predicted))
+        return out
+
+
+def observe_run(
+    run: Run, rays: RayModel, brick: BrickModel, *, progress: ProcessProgress | None = None
+) -> tuple[LedObservations, list[str]]:
+    """Return the LEDs seen in a run, and what was wrong with its video, in words.
+
+    Raises
+    ------
+    VideoError
+        If the run has no video with frame times.
+    """
+    frames = require_video(run)
+    pictures = RunPictures(run, frames)
+    progress = progress or Silent()
+    progress.stage(FIND, frames.n_frames)
+    observations = pictures.observe(rays, brick, "default", progress)
+    return observations, [*run.problems, *pictures.problems()]
