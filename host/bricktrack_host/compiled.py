@@ -1,34 +1,32 @@
 """The one way in which loops are compiled: once a machine, without the interpreter's lock.
 
 Numba keeps the code of each function under the time stamp of its own file, and would go on using it after a
-change in another file that the function calls into. So the code is kept in a folder named after what all
-modules hold that compile: when one changes, everything is compiled anew, once.
+change in another file that the function calls into. So the code is kept in a folder named after what the
+function's module holds, and all modules of ours that it imports from, and so on: a change compiles anew what
+it can reach, once, and nothing else.
 """
 
 import hashlib
 import os
+import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import ParamSpec, TypeVar, cast
 
 import numba
 from numba import njit
 
+import bricktrack_common
+
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-
-
-def _folder() -> Path:
-    root = Path(os.environ.get("NUMBA_CACHE_DIR") or Path.home() / ".cache" / "bricktrack" / "compiled")
-    held = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.rglob("*.py")):
-        text = source.read_bytes()
-        if b"import compiled" in text:
-            held.update(text)
-    return root / held.hexdigest()[:16]
-
-
-numba.config.CACHE_DIR = str(_folder())  # type: ignore[attr-defined]
+_ROOT = Path(os.environ.get("NUMBA_CACHE_DIR") or Path.home() / ".cache" / "bricktrack" / "compiled")
+_OURS = {
+    "bricktrack_host": Path(__file__).parent,
+    "bricktrack_common": Path(bricktrack_common.__file__).parent,
+}
+_IMPORT = re.compile(r"^\s*from (bricktrack_\w+)([\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -37,4 +35,41 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     Division by zero gives infinity or NaN, as in numpy. The first call on a machine compiles; the code is
     kept in the user's cache folder, or in ``NUMBA_CACHE_DIR``.
     """
+    numba.config.CACHE_DIR = str(_folder(function.__code__.co_filename))  # type: ignore[attr-defined]
     return cast(Callable[_P, _R], njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+def _folder(filename: str) -> Path:
+    held = hashlib.sha256()
+    for source in sorted(sources_behind(Path(filename))):
+        held.update(source.name.encode() + _read(source))
+    return _ROOT / held.hexdigest()[:16]
+
+
+def sources_behind(source: Path) -> set[Path]:
+    """Return a module's file and those of our modules that it imports from, however indirectly."""
+    reached: set[Path] = set()
+    open_: list[Path] = [source]
+    while open_:
+        at = open_.pop()
+        if at not in reached:
+            reached.add(at)
+            open_ += _imported(at)
+    return reached
+
+
+@cache
+def _imported(source: Path) -> tuple[Path, ...]:
+    found = []
+    for package, inner, names in _IMPORT.findall(_read(source).decode()):
+        if package in _OURS:
+            base = _OURS[package].joinpath(*inner.split("."))
+            tried = [base.with_suffix(".py"), base / "__init__.py"]
+            tried += [base / f"{name}.py" for name in re.findall(r"\w+", names)]
+            found += [path for path in tried if path.is_file()]
+    return tuple(found)
+
+
+@cache
+def _read(source: Path) -> bytes:
+    return source.read_bytes()
