@@ -23,7 +23,6 @@ import pyarrow as pa
 from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_common.run_manifest import MANIFEST_NAME
 from bricktrack_host.assemblies.combined_test import TestSummary, read_components, read_test
 from bricktrack_host.assemblies.motion_history import (
     HistoryError,
@@ -31,11 +30,10 @@ from bricktrack_host.assemblies.motion_history import (
     component_histories,
     run_history,
 )
-from bricktrack_host.pipeline import RESULTS_FOLDER
 from bricktrack_host.quality import LedFlag, PoseFlag, describe
 from bricktrack_host.results.daq_table import join_samples, read_daq_csv
 from bricktrack_host.results.export import read_run_table
-from bricktrack_host.results.result_store import RunResult, read_result
+from bricktrack_host.results.result_store import RunResult, read_result, results_of
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.results.run_summary import KeyFigures, key_figures, verdict
 from bricktrack_host.results.spectra import Spectrum, amplitude_spectrum
@@ -190,8 +188,7 @@ def load_run(folder: str | Path) -> Run:
     RunFormatError
         If it holds no results, of this version.
     """
-    folder = Path(folder)
-    results = folder / RESULTS_FOLDER if (folder / MANIFEST_NAME).is_file() else folder
+    results = results_of(Path(folder))
     return Run(results, read_result(results))
 
 

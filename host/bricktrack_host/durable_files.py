@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -41,7 +42,13 @@ def rename_durably(source: Path, target: Path) -> None:
     sync_folder(target.parent)
 
 
-def write_folder_whole(folder: Path, write: Callable[[Path], None], *, marker: str) -> None:
+def write_folder_whole(
+    folder: Path,
+    write: Callable[[Path], object],
+    *,
+    marker: str,
+    keep_if: Callable[[Path, Path], bool] | None = None,
+) -> Path | None:
     """Write a folder of results, replacing one of before: whole or not at all.
 
     Everything is written beside the folder first, synced, and then renamed: a kill at any moment leaves the
@@ -54,6 +61,14 @@ def write_folder_whole(folder: Path, write: Callable[[Path], None], *, marker: s
         Gets the folder to write into.
     marker : str
         Name of a file that every such folder holds: a folder without it is somebody else's.
+    keep_if : callable, optional
+        Tells of the new folder and the one of before whether the latter is to be kept, beside the new one as
+        ``<folder>_1``, then ``_2``. Where it need not be, files that only it holds move into the new one.
+
+    Returns
+    -------
+    kept : Path or None
+        Where the folder of before is now; `None` where there was none, or it was not to be kept.
 
     Raises
     ------
@@ -65,20 +80,45 @@ def write_folder_whole(folder: Path, write: Callable[[Path], None], *, marker: s
     if folder.exists() and not (folder / marker).is_file():
         raise StorageError(f"{folder} exists and holds no {marker}; it is left alone. Move it away")
     with storage_errors(folder, "Results cannot be written; make room, or choose another folder"):
+        if previous.exists() and not folder.exists():  # killed between the two renames below
+            previous.rename(folder)
         for leftover in (partial, previous):
             if leftover.exists():
                 shutil.rmtree(leftover)
         partial.mkdir(parents=True)
         write(partial)
+        is_kept = folder.exists() and keep_if is not None and keep_if(partial, folder)
+        if folder.exists() and keep_if is not None and not is_kept:
+            for path in folder.iterdir():
+                if path.is_file() and not (partial / path.name).exists():
+                    shutil.copy2(path, partial / path.name)
         for path in sorted(partial.iterdir()):
             sync_file(path)
         sync_folder(partial)
+        kept = _next_beside(folder) if is_kept else None
         if folder.exists():
-            folder.rename(previous)
+            folder.rename(kept or previous)
         partial.rename(folder)
         sync_folder(folder.parent)
         if previous.exists():
             shutil.rmtree(previous)
+    return kept
+
+
+def kept_beside(folder: Path, *, marker: str) -> list[Path]:
+    """Return the folders of before that `write_folder_whole` has kept, the oldest first."""
+    return [path for _, path in _beside(folder) if (path / marker).is_file()]
+
+
+def _beside(folder: Path) -> list[tuple[int, Path]]:
+    name = re.compile(re.escape(folder.name) + r"_([1-9][0-9]*)")
+    there = folder.parent.iterdir() if folder.parent.is_dir() else ()
+    return sorted((int(match[1]), path) for path in there if (match := name.fullmatch(path.name)))
+
+
+def _next_beside(folder: Path) -> Path:
+    taken = _beside(folder)
+    return folder.with_name(f"{folder.name}_{taken[-1][0] + 1 if taken else 1}")
 
 
 @contextmanager

@@ -19,7 +19,13 @@ from bricktrack_host.calibration.calibration_file import load_calibration, requi
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting.report import ReportExtras, render_report
 from bricktrack_host.reporting.report_pictures import PICTURES_NAME, save_pictures
-from bricktrack_host.results.result_store import Provenance, RunResult, software_version, write_results
+from bricktrack_host.results.result_store import (
+    RESULTS_FOLDER,
+    Provenance,
+    RunResult,
+    software_version,
+    write_results,
+)
 from bricktrack_host.results.true_motion import read_true_motion
 from bricktrack_host.results.truth import TruthComparison, compare_with_truth
 from bricktrack_host.stages.clocks import align, choose_imu, fit_square_wave, rest_pose
@@ -45,18 +51,21 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-RESULTS_FOLDER = "results"
 REPORT_NAME = "report.html"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProcessedRun:
-    """What processing a run gave: values, the report's extras, and where it all is on disk."""
+    """What processing a run gave: values, the report's extras, and where it all is on disk.
+
+    ``earlier`` is where the results of before are kept, if they said something else.
+    """
 
     result: RunResult
     folder: Path
     report: Path
     truth: TruthComparison | None
+    earlier: Path | None = None
 
 
 def process_run(
@@ -78,7 +87,8 @@ def process_run(
     calibration, layout : Path
         Of this unit's camera in this sensor mode, and of the brick that it looks at.
     output : Path, optional
-        Folder of the results; ``<run folder>/results`` if not given.
+        Folder of the results; ``<run folder>/results`` if not given. Earlier results that say something else
+        are kept beside it, as ``<run folder>/results_1``.
     settings : ProcessSettings, optional
     truth : Path, optional
         True motion of a simulated run; its own ``truth.npz`` is found without being named.
@@ -155,9 +165,9 @@ def process_run(
             save_pictures(partial / PICTURES_NAME, overlays, covered)
             (partial / REPORT_NAME).write_text(page, encoding="utf-8")
 
-        write_results(result, results_folder, also=write_page)
+        earlier = write_results(result, results_folder, also=write_page)
     logger.info("%s: processed in %.1f s", folder.name, sum(stages.seconds.values()))
-    return ProcessedRun(result, results_folder, results_folder / REPORT_NAME, comparison)
+    return ProcessedRun(result, results_folder, results_folder / REPORT_NAME, comparison, earlier)
 
 
 def _require_poses(optical: OpticalTrack, run: Run, brick: BrickModel) -> None:

@@ -7,7 +7,6 @@ import typer
 from rich.table import Table
 
 from bricktrack_common.errors import BricktrackError, ConfigError
-from bricktrack_common.run_manifest import MANIFEST_NAME
 from bricktrack_host.cli._console import err, out, print_json, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
 from bricktrack_host.cli._units import JsonOption
@@ -181,10 +180,9 @@ def _report(
 
 
 def _read_run(run: Path) -> "tuple[OpticalTrack, ImuTrack, bool, bool]":
-    from bricktrack_host.pipeline import RESULTS_FOLDER
-    from bricktrack_host.results.result_store import read_result
+    from bricktrack_host.results.result_store import read_result, results_of
 
-    result = read_result(run / RESULTS_FOLDER if (run / MANIFEST_NAME).is_file() else run)
+    result = read_result(results_of(run))
     if result.imu is None:
         raise ConfigError(f"{run}: the run was processed without inertial samples: there is nothing to align")
     own_clock = result.manifest.origin == "bricktrackd"

@@ -41,8 +41,8 @@ def combine(
         bricktrack combine runs/*_shake-12 --name shake-12 --fleet lab/fleet.toml --json
     """
     from bricktrack_host.assemblies.combined_test import combine_test
-    from bricktrack_host.pipeline import RESULTS_FOLDER
     from bricktrack_host.reporting.combined_report import REPORT_NAME, write_combined_report
+    from bricktrack_host.results.result_store import results_of
 
     path = fleet_path(fleet)
     config = load_fleet(path)
@@ -53,7 +53,7 @@ def combine(
             raise ConfigError(
                 f"{run}: unit {unit!r} has another run here, {results[unit].parent}; give one of them"
             )
-        results[unit] = run / RESULTS_FOLDER
+        results[unit] = results_of(run)
     folder = output or path.resolve().parent / "tests" / name
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     with Progress(*columns, console=err, transient=True) as bar:

@@ -140,14 +140,11 @@ def _filmed(seed: int, *, output: Path, as_json: bool) -> None:
 
 
 def _recorded(run: Path, positions: Path, *, align: bool, output: Path, as_json: bool) -> None:
-    from bricktrack_common.run_manifest import MANIFEST_NAME
     from bricktrack_host.evaluation.recorded import read_positions, score_recording
-    from bricktrack_host.pipeline import RESULTS_FOLDER
-    from bricktrack_host.results.result_store import read_result
+    from bricktrack_host.results.result_store import read_result, results_of
 
-    folder = run / RESULTS_FOLDER if (run / MANIFEST_NAME).is_file() else run
     reference = read_positions(positions)
-    result = read_result(folder)
+    result = read_result(results_of(run))
     score = score_recording(result.optical, reference, name=positions.stem, align=align)
     title = f"Recorded sweep {positions.stem} of {result.manifest.run_id}"
     extra = {"simulated": result.manifest.simulated, "run": result.manifest.run_id, "aligned": align}

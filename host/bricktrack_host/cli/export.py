@@ -67,9 +67,9 @@ def export(
     import pyarrow.compute
 
     from bricktrack_host.assemblies.combined_test import TEST_SUMMARY_NAME, read_components, read_test
-    from bricktrack_host.pipeline import RESULTS_FOLDER
     from bricktrack_host.results.daq_table import join_samples, read_daq_csv
     from bricktrack_host.results.export import read_run_table, write_table
+    from bricktrack_host.results.result_store import results_of
 
     if (source / TEST_SUMMARY_NAME).is_file():
         names = [entry.name for entry in read_test(source).assemblies]
@@ -88,8 +88,7 @@ def export(
     else:
         if assembly is not None or component is not None:
             raise ConfigError(f"{source} is a run; --assembly and --component are for tests")
-        folder = source / RESULTS_FOLDER if (source / RESULTS_FOLDER).is_dir() else source
-        motion, number = read_run_table(folder, table), "edge_index"
+        motion, number = read_run_table(results_of(source), table), "edge_index"
         stem = f"{_run_of(motion)}_{table}"
         if daq is not None and table != "samples":
             raise ConfigError(f"--daq needs one row a sample: leave out --table {table}")

@@ -35,7 +35,7 @@ def overlay(
 
         bricktrack overlay runs/b2_9f31c2_0007_shake --frames 200:260 --slow 20 -o impact.mp4
     """
-    from bricktrack_host.pipeline import RESULTS_FOLDER
+    from bricktrack_host.results.result_store import results_of
     from bricktrack_host.viewing.overlay_video import write_overlay
 
     path = output or Path(f"{run.resolve().name}_overlay.mp4")
@@ -43,7 +43,7 @@ def overlay(
     with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task("")
         n = write_overlay(
-            run, results or run / RESULTS_FOLDER, path, slow=slow, scale=scale, frames=_range(frames),
+            run, results or results_of(run), path, slow=slow, scale=scale, frames=_range(frames),
             progress=lambda done, of: bar.update(task, completed=done, total=of),
         )  # fmt: skip
     out.print(f"{n} frames: {path}", markup=False, soft_wrap=True)

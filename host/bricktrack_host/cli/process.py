@@ -126,9 +126,10 @@ def process(
 ) -> None:
     """Turn recordings into motion: poses, tables (Parquet and CSV) and a report in each run's folder.
 
-    A run processed again gives the same numbers. Several runs are processed side by side, each in a process
-    of its own; one that fails does not stop the others. Exits with 1 if a run could not be processed. Ctrl-C
-    leaves each run's earlier results, or its new ones, whole.
+    A run processed again gives the same numbers; earlier results that differ are kept beside the new ones, as
+    results_1. Several runs are processed side by side, each in a process of its own; one that fails does not
+    stop the others. Exits with 1 if a run could not be processed. Ctrl-C leaves each run's earlier results, or
+    its new ones, whole.
 
     For example:
 
@@ -297,6 +298,12 @@ def say_processed(processed: "ProcessedRun", *, budget: bool = True) -> None:
         _say_budget(result.timings_s, len(result.optical.t_ns))
     out.print(f"results: {processed.folder}", markup=False, soft_wrap=True)
     out.print(f"report:  {processed.report}", markup=False, soft_wrap=True)
+    if processed.earlier is not None:
+        out.print(
+            f"earlier: {processed.earlier}; what changed: bricktrack compare {processed.folder}",
+            markup=False,
+            soft_wrap=True,
+        )
 
 
 def _say_budget(timings_s: dict[str, float], n_frames: int) -> None:

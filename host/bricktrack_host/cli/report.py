@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from bricktrack_common.errors import ConfigError
-from bricktrack_common.run_manifest import MANIFEST_NAME
 from bricktrack_host.cli._console import err, out
 from bricktrack_host.cli.process import TruthOption, say_truth
 
@@ -74,7 +73,7 @@ def _report_test(folder: Path, output: Path | None, *, interactive: bool) -> Pat
 
 def _interactive_run(run: Path, output: Path | None) -> Path:
     from bricktrack_host.reporting.interactive_report import INTERACTIVE_NAME, write_interactive_report
-    from bricktrack_host.results.result_store import read_result
+    from bricktrack_host.results.result_store import read_result, results_of
     from bricktrack_host.results.run_summary import key_figures, verdict
 
     folder = results_of(run)
@@ -90,7 +89,7 @@ def _report_run(run: Path, output: Path | None, truth: Path | None) -> Path:
     from bricktrack_host.pipeline import REPORT_NAME, find_truth
     from bricktrack_host.reporting.report import ReportExtras, write_report
     from bricktrack_host.reporting.report_pictures import PICTURES_NAME, load_pictures
-    from bricktrack_host.results.result_store import read_result
+    from bricktrack_host.results.result_store import read_result, results_of
     from bricktrack_host.results.run_summary import key_figures, verdict
     from bricktrack_host.results.true_motion import read_true_motion
     from bricktrack_host.results.truth import compare_with_truth
@@ -105,13 +104,6 @@ def _report_run(run: Path, output: Path | None, truth: Path | None) -> Path:
     _say_verdict(result.manifest.run_id, *verdict(result, key_figures(result)))
     say_truth(comparison)
     return page
-
-
-def results_of(run: Path) -> Path:
-    """Return the results folder of a run, or the folder itself where it holds the results."""
-    from bricktrack_host.pipeline import RESULTS_FOLDER
-
-    return run / RESULTS_FOLDER if (run / MANIFEST_NAME).is_file() else run
 
 
 def _say_verdict(run_id: str, line: str, problems: list[str]) -> None:

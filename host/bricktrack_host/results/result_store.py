@@ -4,6 +4,7 @@ Everything but `timings.json` depends on the recording, the settings and the sof
 processed again gives the same bytes.
 """
 
+import hashlib
 import importlib.metadata
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,10 +18,11 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from bricktrack_common.arrays import IntArray
+from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import RunFormatError
-from bricktrack_common.run_manifest import RunManifest
+from bricktrack_common.run_manifest import MANIFEST_NAME, RunManifest
 from bricktrack_common.typed_data import dump_json, load_json
-from bricktrack_host.durable_files import write_folder_whole
+from bricktrack_host.durable_files import kept_beside, write_folder_whole
 from bricktrack_host.results.daq_clock import EdgeFit, fit_edges
 from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.results.result_tables import (
@@ -39,6 +41,7 @@ from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, Optica
 
 RESULTS_SCHEMA = "bricktrack.results"
 RESULTS_VERSION = 1
+RESULTS_FOLDER = "results"
 SUMMARY_NAME = "summary.json"
 TIMINGS_NAME = "timings.json"
 
@@ -153,8 +156,10 @@ def software_version() -> str:
     return importlib.metadata.version("bricktrack")
 
 
-def write_results(result: RunResult, folder: Path, *, also: Callable[[Path], None] | None = None) -> None:
-    """Write a run's results, replacing a folder of an earlier processing.
+def write_results(
+    result: RunResult, folder: Path, *, also: Callable[[Path], object] | None = None
+) -> Path | None:
+    """Write a run's results; those of an earlier processing that say something else are kept beside them.
 
     The folder is written whole or not at all; see `write_folder_whole`.
 
@@ -165,6 +170,12 @@ def write_results(result: RunResult, folder: Path, *, also: Callable[[Path], Non
         As ``<run folder>/results``.
     also : callable, optional
         Writes more files into the folder that it is given, before that takes its name.
+
+    Returns
+    -------
+    earlier : Path or None
+        Where the results of before are kept now, as ``<run folder>/results_1``; `None` where there were none,
+        or they were the same to the last bit.
 
     Raises
     ------
@@ -177,7 +188,29 @@ def write_results(result: RunResult, folder: Path, *, also: Callable[[Path], Non
         if also is not None:
             also(partial)
 
-    write_folder_whole(folder, write, marker=SUMMARY_NAME)
+    return write_folder_whole(
+        folder, write, marker=SUMMARY_NAME, keep_if=lambda new, old: results_id(new) != results_id(old)
+    )
+
+
+def results_of(run: Path) -> Path:
+    """Return the results folder of a run, or the folder itself where it holds the results."""
+    return run / RESULTS_FOLDER if (run / MANIFEST_NAME).is_file() else run
+
+
+def earlier_results(folder: Path) -> list[Path]:
+    """Return the results of earlier processings that are kept beside a results folder, the oldest first."""
+    return kept_beside(folder, marker=SUMMARY_NAME)
+
+
+def results_id(folder: Path) -> str:
+    """Return what names a processing of a run: 16 hexadecimal digits of a hash of its summary and tables.
+
+    Results of the same numbers have the same id, whenever and wherever they were made.
+    """
+    names = sorted(p.name for p in folder.iterdir() if p.name == SUMMARY_NAME or p.suffix == ".parquet")
+    listed = "".join(f"{name} {sha256_file(folder / name)}\n" for name in names)
+    return hashlib.sha256(listed.encode()).hexdigest()[:16]
 
 
 def _write_files(result: RunResult, folder: Path) -> None:

@@ -17,7 +17,7 @@ from bricktrack_common.errors import RunFormatError, StorageError, TrackingError
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results import result_store as results_module
 from bricktrack_host.results.rest_pose import tare
-from bricktrack_host.results.result_store import read_result, write_results
+from bricktrack_host.results.result_store import earlier_results, read_result, results_id, write_results
 from bricktrack_host.tracks import OpticalTrack
 
 ROOT = Path(__file__).parents[3]
@@ -198,6 +198,35 @@ def test_a_kill_while_writing_leaves_the_old_results_whole(folder, tmp_path, res
     assert {p.name: p.read_bytes() for p in target.iterdir()} == before
     write_results(result, target)
     assert [p.name for p in tmp_path.iterdir()] == ["results"]
+
+
+def test_results_that_differ_are_written_beside_and_the_same_are_not(tmp_path, result):
+    target = tmp_path / "results"
+    assert write_results(result, target) is None
+    first = {p.name: p.read_bytes() for p in target.iterdir()}
+    (target / "interactive.html").write_text("a page made since")
+    assert write_results(replace(result, timings_s={"decode": 9.9}), target) is None
+    assert earlier_results(target) == []
+    assert (target / "interactive.html").read_text() == "a page made since"
+    changed = replace(result, problems=(*result.problems, "another calibration"))
+    assert write_results(changed, target) == tmp_path / "results_1"
+    for name, data in first.items():
+        assert name == "timings.json" or (tmp_path / "results_1" / name).read_bytes() == data
+    assert read_result(target).problems == changed.problems
+    (tmp_path / "results_notes").mkdir()
+    (tmp_path / "results_7").mkdir()  # of somebody else, but its number is taken
+    assert write_results(result, target) == tmp_path / "results_8"
+    assert earlier_results(target) == [tmp_path / "results_1", tmp_path / "results_8"]
+    assert results_id(target) == results_id(tmp_path / "results_1") != results_id(tmp_path / "results_8")
+
+
+def test_a_kill_between_two_renames_gives_the_old_folder_back(tmp_path, result):
+    target = tmp_path / "results"
+    write_results(result, target)
+    target.rename(tmp_path / ".results.previous")  # as a kill leaves it
+    changed = replace(result, problems=("another",))
+    assert write_results(changed, target) == tmp_path / "results_1"
+    assert read_result(tmp_path / "results_1").problems == result.problems
 
 
 def test_a_full_disk_is_said_and_leaves_no_result(result, tmp_path, monkeypatch):
