@@ -70,7 +70,7 @@ class ImuSensors:
     ----------
     world : SimWorld
     on_camera : bool
-        Whether the chip sits on the camera's component, which rests, instead of at the brick's lever arm.
+        Whether the chip sits on the camera's component instead of at the brick's lever arm.
     stream : int
         Tells the random numbers of one chip from another's.
     """
@@ -95,28 +95,30 @@ class ImuSensors:
             np.random.default_rng([*self._key, t_ns & 0x7FFFFFFF]).normal(size=9) * world.settings.imu.noise
         )
         acc_sd, gyro_sd = noise_sds(setup)
-        acc, gyro_dps, R_camera_imu = self._true(since_s, setup)
+        acc, gyro_dps, R_still_imu = self._true(since_s, setup)
         acc = acc + self.acc_bias_mps2 + acc_sd * noise[:3]
         gyro_dps = gyro_dps + self.gyro_bias_dps + gyro_sd * noise[3:6]
         limit = setup.acc_range_g * STANDARD_GRAVITY_MPS2
         return Measured(
             acc_mps2=np.clip(acc, -limit, limit),
             gyro_dps=np.clip(gyro_dps, -setup.gyro_range_dps, setup.gyro_range_dps),
-            mag_ut=_MAG_FIELD_CAMERA_UT @ R_camera_imu + _MAG_NOISE_UT * noise[6:],
-            R_gravity_imu=self._R_gravity_camera @ R_camera_imu,
+            mag_ut=_MAG_FIELD_CAMERA_UT @ R_still_imu + _MAG_NOISE_UT * noise[6:],
+            R_gravity_imu=self._R_gravity_camera @ R_still_imu,
         )
 
     def _true(self, since_s: float, setup: SensorSetup) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return filtered specific force, m/s^2, filtered rate, deg/s, and ``R_camera_imu``."""
+        """Return filtered specific force, m/s^2, filtered rate, deg/s, and ``R_still_imu``."""
         world = self._world
-        if self._on_camera:
-            return -world.gravity_camera_mps2, np.zeros(3), np.eye(3)
         acc_delays, acc_weights = low_pass_taps(ACC_LAG_S * ACC_BANDWIDTH_HZ / setup.acc_bandwidth_hz)
         gyro_delays, gyro_weights = low_pass_taps(GYRO_LAG_S * GYRO_BANDWIDTH_HZ / setup.gyro_bandwidth_hz)
-        ideal = world.inertial(since_s - np.concatenate([acc_delays, gyro_delays, [0.0]]))
+        at_s = since_s - np.concatenate([acc_delays, gyro_delays, [0.0]])
+        if self._on_camera:
+            ideal = world.camera_inertial(at_s, at_mm=np.array(world.settings.imu.on_camera_mm))
+        else:
+            ideal = world.inertial(at_s)
         n = len(acc_delays)
         gyro = gyro_weights @ ideal.omega_radps[n:-1]
-        return acc_weights @ ideal.specific_force_mps2[:n], np.rad2deg(gyro), ideal.R_camera_imu[-1]
+        return acc_weights @ ideal.specific_force_mps2[:n], np.rad2deg(gyro), ideal.R_still_imu[-1]
 
 
 def noise_sds(setup: SensorSetup) -> tuple[float, float]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import ConfigError
+from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2
 from bricktrack_device.sim.settings import SimSettings
 
 _RAMP_S = 0.5
@@ -59,6 +60,19 @@ def make_motion(settings: SimSettings) -> Motion:
     return _WithImpacts(
         sines, times, rng.uniform(0.001, 0.003, len(times)), _kicks(settings, sines, times, rng)
     )
+
+
+def make_camera_motion(settings: SimSettings) -> Motion:
+    """Return how the camera's component moves, from where it rests, in its axes at rest."""
+    rng = np.random.default_rng([settings.seed, 11])
+    frequencies = rng.uniform(3.0, 10.0, (6, 6))
+    omega = 2 * np.pi * frequencies
+    rms = np.full((6, 6), np.sqrt(2 / frequencies.shape[1]))  # of each sine, so that all have an rms of 1
+    acceleration_mmps2 = 1e3 * settings.camera_acc_g * STANDARD_GRAVITY_MPS2
+    rms[:3] *= acceleration_mmps2 / omega[:3] ** 2
+    rms[3:] *= np.deg2rad(settings.camera_rocking_deg)
+    window = _Window(settings.shake_s, min(_RAMP_S, settings.shake_s / 4))
+    return _Sines(window, rms, frequencies, rng.uniform(0, 2 * np.pi, (6, 6)))
 
 
 def _kicks(settings: SimSettings, sines: Motion, times: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -72,7 +72,9 @@ class SimImu(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     noise, bias : float
         Times those of the data sheet.
     on_camera : list of str
-        Buses whose chip sits on the camera's component, which rests, and not on the brick.
+        Buses whose chip sits on the camera's component, and not on the brick.
+    on_camera_mm : (float, float, float), mm
+        Where it sits there, seen from the projection centre, camera axes; its axes are the camera's.
     """
 
     address: Literal[0x28, 0x29] = 0x28
@@ -81,6 +83,7 @@ class SimImu(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     noise: _NotNegative = 1.0
     bias: _NotNegative = 1.0
     on_camera: list[str] = []
+    on_camera_mm: tuple[float, float, float] = (18.0, -25.0, -7.0)
 
 
 class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -97,6 +100,9 @@ class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         ``motion_csv`` (columns ``t_s, x_mm, y_mm, z_mm`` and, if wanted, ``rx_deg, ry_deg, rz_deg``).
     amplitude_mm, amplitude_deg : float
         Largest displacement and rotation along an axis, roughly.
+    camera_acc_g, camera_rocking_deg : float
+        How the camera's own component moves while the brick shakes: rms of its acceleration and of its
+        rotation, along and about each axis, 3 to 10 Hz. What the camera sees of the brick stays the same.
     impact_mps : float
         Largest change of velocity in an impact, within 1 to 3 ms: 0.1 m/s is 5 to 16 g, more clips at 16 g.
     shake_delay_s : float
@@ -129,6 +135,8 @@ class SimSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     amplitude_mm: _NotNegative = 3.0
     amplitude_deg: _NotNegative = 2.0
     impact_mps: _NotNegative = 0.1
+    camera_acc_g: _NotNegative = 0.0
+    camera_rocking_deg: _NotNegative = 0.0
     shake_delay_s: _Positive = 1.0
     quiet_s: _NotNegative = 1.0
     shake_s: _Positive = 12.0

@@ -16,7 +16,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel, brick_model_from_file, load_brick_model
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.rotations import matrix_from_rvec
-from bricktrack_device.sim.motions import make_motion
+from bricktrack_device.sim.motions import make_camera_motion, make_motion
 from bricktrack_device.sim.paper_layout import PAPER_LAYOUT
 from bricktrack_device.sim.settings import SimSettings
 
@@ -41,12 +41,13 @@ class Inertial:
     Attributes
     ----------
     specific_force_mps2, omega_radps : ndarray, shape (n, 3)
-    R_camera_imu : ndarray, shape (n, 3, 3)
+    R_still_imu : ndarray, shape (n, 3, 3)
+        To the axes of the camera at rest.
     """
 
     specific_force_mps2: FloatArray
     omega_radps: FloatArray
-    R_camera_imu: FloatArray
+    R_still_imu: FloatArray
 
 
 class SimWorld:
@@ -64,6 +65,8 @@ class SimWorld:
         self.brick = load_layout(settings)
         self._epoch = epoch
         self._motion = make_motion(settings)
+        self._camera_motion = make_camera_motion(settings)
+        self._camera_moves = settings.camera_acc_g > 0 or settings.camera_rocking_deg > 0
         self._R_rest = matrix_from_rvec(_REST_RVEC_RAD)
         imu = self.brick.imu_lever_arm_mm, self.brick.R_brick_imu
         self._lever_arm_mm = np.zeros(3) if imu[0] is None else imu[0]
@@ -120,9 +123,38 @@ class SimWorld:
         omega, alpha = angular_rate_and_acceleration(q[:, 3:], dq[:, 3:], ddq[:, 3:])
         R = self._R_rest @ matrix_from_rvec(q[:, 3:])
         arm_m = self._lever_arm_mm * 1e-3
-        swing = _cross(alpha, arm_m) + _cross(omega, _cross(omega, arm_m))
-        force = np.einsum("nji,nj->ni", R, ddq[:, :3] * 1e-3 - _GRAVITY_CAMERA_MPS2) + swing
-        return Inertial(force @ self._R_brick_imu, omega @ self._R_brick_imu, R @ self._R_brick_imu)
+        arm = np.broadcast_to(arm_m, omega.shape)
+        turned = [
+            np.einsum("nij,nj->ni", R, v)
+            for v in (arm, _cross(omega, arm_m), _cross(alpha, arm_m) + _cross(omega, _cross(omega, arm_m)))
+        ]
+        at_rest_m = 1e-3 * np.stack([self._t_rest_mm + q[:, :3], dq[:, :3], ddq[:, :3]])
+        camera = self._on_camera(since_s, *(at_rest_m + np.stack(turned)))
+        force = np.einsum("nji,nj->ni", R, camera.specific_force_mps2)
+        omega = omega + np.einsum("nji,nj->ni", R, camera.omega_radps)
+        return Inertial(
+            force @ self._R_brick_imu, omega @ self._R_brick_imu, camera.R_still_imu @ R @ self._R_brick_imu
+        )
+
+    def camera_inertial(self, since_s: FloatArray, *, at_mm: FloatArray) -> Inertial:
+        """Return what ideal sensors fixed to the camera feel at a point of its axes, mm; see `inertial`."""
+        still = np.zeros((len(since_s), 3))
+        return self._on_camera(since_s, still + 1e-3 * at_mm, still, still)
+
+    def _on_camera(
+        self, since_s: FloatArray, p_m: FloatArray, v_mps: FloatArray, a_mps2: FloatArray
+    ) -> Inertial:
+        """Return what a body in the camera's axes feels that moves at p, v, a in them; axes the camera's."""
+        n = len(since_s)
+        if not self._camera_moves:
+            return Inertial(a_mps2 - _GRAVITY_CAMERA_MPS2, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+        t = np.where(np.isfinite(since_s), since_s, -1.0) - self.settings.quiet_s
+        q, dq, ddq = self._camera_motion(np.asarray(t, dtype=np.float64))
+        omega, alpha = angular_rate_and_acceleration(q[:, 3:], dq[:, 3:], ddq[:, 3:])
+        R = matrix_from_rvec(q[:, 3:])
+        own = np.einsum("nji,nj->ni", R, 1e-3 * ddq[:, :3] - _GRAVITY_CAMERA_MPS2)
+        swing = _cross(alpha, p_m) + _cross(omega, _cross(omega, p_m)) + 2 * _cross(omega, v_mps)
+        return Inertial(own + swing + a_mps2, omega, R)
 
     def card_cover(self, t_ns: IntArray) -> FloatArray:
         """Return how far the opaque card has slid before the lens: 0 away, 1 hides everything.

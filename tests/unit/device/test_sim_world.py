@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import ConfigError
@@ -55,6 +56,48 @@ def test_the_accelerometer_feels_its_own_way_through_space_and_gravity() -> None
         world.inertial((t_ns - FIRST_NS) * 1e-9).specific_force_mps2, expected, atol=2e-3
     )
     assert np.linalg.norm(gravity) == pytest.approx(9.80665) and gravity[1] > 9.7  # v points down
+
+
+def test_with_a_camera_that_moves_each_sensor_feels_its_own_way_through_space() -> None:
+    settings = SimSettings(
+        motion="sines", amplitude_deg=15.0, quiet_s=0.5, shake_s=6.0, camera_acc_g=0.3, camera_rocking_deg=3.0
+    )
+    world = armed_world(settings)
+    t_s = np.arange(0.6, 6.4, 0.037)
+    camera_arm_mm = np.array([18.0, -25.0, -7.0])
+    chip = world.camera_inertial(t_s, at_mm=camera_arm_mm)
+    # The camera's acceleration is what a chip in its projection centre feels; from it the way, by quadrature.
+    fine = np.arange(0.3, 6.7, 2e-4)
+    centre = world.camera_inertial(fine, at_mm=np.zeros(3))
+    still = Rotation.from_matrix(centre.R_still_imu)
+    acceleration = still.apply(centre.specific_force_mps2) + world.gravity_camera_mps2
+    way = CubicSpline(fine, acceleration).antiderivative(2)
+    step = (still[:-1].inv() * still[1:]).as_rotvec() / 2e-4
+    rate = CubicSpline(0.5 * (fine[1:] + fine[:-1]), step)
+    turned = RotationSpline(fine, still)
+    np.testing.assert_allclose(chip.omega_radps, rate(t_s), atol=2e-3)
+
+    def felt(arm: FloatArray, at_s: FloatArray, *, on_brick: bool) -> FloatArray:
+        def place(s: FloatArray) -> FloatArray:
+            R, t_mm = world.pose(FIRST_NS + np.rint(s * 1e9).astype(np.int64))
+            p = R @ arm + t_mm if on_brick else np.tile(arm, (len(s), 1))
+            return np.asarray(turned(s).apply(1e-3 * p) + way(s))
+
+        h = 2e-4
+        a = (place(at_s - h) - 2 * place(at_s) + place(at_s + h)) / h**2
+        axes = turned(at_s)
+        if on_brick:
+            axes = axes * Rotation.from_matrix(world.pose(FIRST_NS + np.rint(at_s * 1e9).astype(np.int64))[0])
+        return np.asarray(axes.inv().apply(a - world.gravity_camera_mps2))
+
+    # The splines and h^2/12 of the fourth derivative leave some 0.01 m/s^2 of 30.
+    np.testing.assert_allclose(chip.specific_force_mps2, felt(camera_arm_mm, t_s, on_brick=False), atol=0.03)
+    brick = world.inertial(t_s)
+    np.testing.assert_allclose(brick.specific_force_mps2, felt(LEVER_ARM_MM, t_s, on_brick=True), atol=0.03)
+    shaking = (t_s > 1.0) & (t_s < 6.0)
+    rms = np.sqrt(np.mean((acceleration[(fine > 1.0) & (fine < 6.0)]) ** 2, axis=0)) / 9.80665
+    assert (rms > 0.2).all() and (rms < 0.4).all()
+    assert 2.0 < np.degrees(turned(t_s[shaking]).magnitude()).mean() < 10.0
 
 
 def test_the_velocity_is_that_of_the_origin() -> None:
