@@ -19,7 +19,7 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem, residuals, score_noise
 
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
-_MOST_SYSTEMATIC = 2  # steps
+_LEAST_SYSTEMATIC, _MOST_SYSTEMATIC = -4, 2  # steps: from a fortieth of what is stated to six times that
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
 _MAX_SCALE_ROUNDS = 4
 _SCALE_STANDS = 1.25
@@ -148,7 +148,7 @@ def _choose_noise(
     scores: list[dict[tuple[int, int], float]] = [{} for _ in parts]
     last: list[dict[tuple[int, int], FloatArray]] = [{} for _ in parts]
     for moves in (
-        [(0, 0), (0, -1), (0, -2), (0, 1), (0, 2)],
+        [(0, 0), (0, -1), (0, -2), (0, -3), (0, -4), (0, 1), (0, 2)],
         [(-1, 0), (-2, 0), (-3, 0)],
         [(0, -1), (0, 1)],
     ):
@@ -163,7 +163,7 @@ def _choose_noise(
         log_likelihood, ends = score_noise(problem, gyro, acc)
         for b, steps in enumerate(tried):
             for n, (i, j) in enumerate(steps):
-                if abs(j) <= _MOST_SYSTEMATIC:
+                if _LEAST_SYSTEMATIC <= j <= _MOST_SYSTEMATIC:
                     scores[b][i, j] = float(log_likelihood[b, n]) - _EARN_PER_STEP * (abs(i) + abs(j))
                     last[b][i, j] = ends[b, n]
         chosen = [max(score, key=score.__getitem__) for score in scores]
