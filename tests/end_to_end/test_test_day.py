@@ -39,7 +39,7 @@ def invoke(*words):
 def lab(tmp_path, monkeypatch):
     """Three light units, a fleet file that names them, and processing that writes invented results at once."""
 
-    def process(runs, *, fleet, jobs):
+    def process(runs, *, fleet, where):
         blank = example.example_result()
         for run in runs:
             manifest = read_manifest(run / MANIFEST_NAME)

@@ -39,3 +39,16 @@ def half_written(folder, progress):
         time.sleep(60)
     finally:
         partial_file.unlink()
+
+
+def dies_once(note, progress):
+    """Be killed the first time, as by a system out of memory."""
+    if not note.exists():
+        note.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return "done at last"
+
+
+def stays(note, progress):
+    note.write_text(str(os.getpid()))
+    time.sleep(60)

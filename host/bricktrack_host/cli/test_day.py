@@ -23,6 +23,15 @@ from bricktrack_host.campaign.test_plan import (
 from bricktrack_host.cli._acknowledged import ask_for, report_answers
 from bricktrack_host.cli._console import err, out, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
+from bricktrack_host.cli._processing import (
+    JobsOption,
+    SchedulerOption,
+    SendOption,
+    TlsAuthorityOption,
+    TlsCertificateOption,
+    TlsKeyOption,
+    Where,
+)
 from bricktrack_host.cli._units import (
     ChosenUnits,
     FleetOption,
@@ -149,12 +158,12 @@ def arm(
 @app.command()
 def collect(
     name: NameArgument,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            "--jobs", "-j", min=1, help="Runs processed at once. \\[default: as the machine allows]"
-        ),
-    ] = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    send: SendOption = "auto",
+    tls_ca: TlsAuthorityOption = None,
+    tls_cert: TlsCertificateOption = None,
+    tls_key: TlsKeyOption = None,
     fleet: FleetOption = None,
     timeout: TimeoutOption = 5.0,
 ) -> None:
@@ -166,6 +175,7 @@ def collect(
 
         bricktrack test collect shake-12
     """
+    where = Where(jobs, scheduler, send, (tls_ca, tls_cert, tls_key))
     plan, chosen = _planned(name, fleet, timeout)
     runs_folder = _runs_folder(chosen)
     wanted: list[UnitConfig] = []
@@ -189,7 +199,7 @@ def collect(
     here = _runs_here(runs_folder, plan)
     todo = [run for run in here.values() if not _is_processed(run)]
     out.print(f"{len(here)} of {len(plan.units)} runs are here, {len(todo)} to process", markup=False)
-    failed = process_folders(todo, fleet=fleet_path(fleet), jobs=jobs)
+    failed = process_folders(todo, fleet=fleet_path(fleet), where=where)
     for problem in problems:
         say_error(problem)
     if problems or failed:

@@ -1,15 +1,30 @@
-"""Runs side by side: each outcome told, failures apart, nothing half-written when stopped."""
+"""Works given to processes of this machine: each outcome told, failures apart, nothing half-written when stopped."""
 
 import os
+import subprocess
+import sys
+import time
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 
 import pytest
-from run_works import half_written, together, work
+import run_works
+from run_works import dies_once, half_written, together, work
 
-from bricktrack_host import many_runs
-from bricktrack_host.many_runs import default_workers, process_side_by_side
+from bricktrack_common.errors import ConfigError
+from bricktrack_host.many_runs import memory
+from bricktrack_host.many_runs.local_processes import LocalProcesses
+from bricktrack_host.many_runs.memory import container_memory_mb, default_workers
+from bricktrack_host.many_runs.workers import Instead, do_all
+
+
+def as_it_came(index, value):
+    return value
+
+
+def process_side_by_side(works, *, workers=2, progress, finish=as_it_came):
+    return do_all(len(works), lambda i: works[i], LocalProcesses(workers), progress=progress, finish=finish)
 
 
 class Heard:
@@ -45,6 +60,7 @@ def test_each_run_gives_its_value_or_its_own_failure():
     assert "ZeroDivisionError: of mine" in outcomes[2].failure
     assert "signal 9" in outcomes[3].failure
     assert "--jobs" in outcomes[3].failure
+    assert "given up after 3 attempts" in outcomes[3].failure
     assert all(h.stages == [("decode", 200)] for h in heard.values())
     assert heard[4].done[-1] == 200
     assert len(heard[4].done) == 100
@@ -77,6 +93,63 @@ def test_stopping_lets_each_run_take_back_what_it_has_half_written(tmp_path):
     assert not (tmp_path / "part").exists()
 
 
+def test_a_work_whose_process_was_killed_is_done_again(tmp_path):
+    outcomes, _ = run_all([partial(dies_once, tmp_path / "been"), partial(work, "b")])
+    assert outcomes[0].value == "done at last"
+    assert outcomes[1].value == "bb"
+
+
+def test_what_cannot_be_read_or_written_here_fails_alone():
+    def work_of(i):
+        if i == 0:
+            raise ConfigError("no such layout")
+        return partial(work, "ab"[i - 1])
+
+    def finish(i, value):
+        if i == 1:
+            raise ConfigError("no room")
+        return value
+
+    outcomes = {
+        o.index: o for o in do_all(3, work_of, LocalProcesses(1), progress=lambda i: Heard(), finish=finish)
+    }
+    assert [outcomes[i].failure for i in range(3)] == ["no such layout", "no room", ""]
+    assert outcomes[2].value == "bb"
+
+
+def test_another_work_can_be_done_instead():
+    def finish(i, value):
+        return Instead(partial(work, "x")) if value == "aa" else value
+
+    outcomes = process_side_by_side([partial(work, "a")], progress=lambda i: Heard(), finish=finish)
+    assert [o.value for o in outcomes] == ["xx"]
+
+
+def test_a_process_ends_when_the_one_that_started_it_is_killed(tmp_path):
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from functools import partial\nfrom pathlib import Path\nimport run_works\n"
+        "from bricktrack_host.many_runs.local_processes import LocalProcesses\n"
+        "class Quiet:\n    stage = advance_to = lambda *a: None\n"
+        "if __name__ == '__main__':\n"
+        "    LocalProcesses(1).submit(partial(run_works.stays, Path(sys.argv[2])), Quiet()).result()\n"
+    )
+    script = tmp_path / "parent.py"
+    script.write_text(code)
+    note = tmp_path / "pid"
+    parent = subprocess.Popen([sys.executable, script, Path(run_works.__file__).parent, note])
+    deadline = time.monotonic() + 30
+    while not note.exists() or not note.read_text():
+        assert time.monotonic() < deadline and parent.poll() is None
+        time.sleep(0.02)
+    pid = int(note.read_text())
+    parent.kill()
+    parent.wait()
+    while Path(f"/proc/{pid}").exists() and "zombie" not in Path(f"/proc/{pid}/status").read_text():
+        assert time.monotonic() < deadline, "it is still there"
+        time.sleep(0.02)
+
+
 @pytest.mark.parametrize(
     ("n_runs", "processors", "memory_mb", "expected"),
     [
@@ -91,8 +164,8 @@ def test_stopping_lets_each_run_take_back_what_it_has_half_written(tmp_path):
 def test_processors_and_memory_bound_how_many_run_at_once(
     monkeypatch, n_runs, processors, memory_mb, expected
 ):
-    monkeypatch.setattr(many_runs.os, "cpu_count", lambda: processors)
-    monkeypatch.setattr(many_runs, "available_memory_mb", lambda: memory_mb)
+    monkeypatch.setattr(memory, "usable_processors", lambda: processors)
+    monkeypatch.setattr(memory, "available_memory_mb", lambda: memory_mb)
     assert default_workers(n_runs) == expected
 
 
@@ -100,4 +173,14 @@ def test_available_memory_is_that_of_the_system():
     if not Path("/proc/meminfo").exists():
         pytest.skip("no /proc/meminfo on this system")
     total_mb = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**20
-    assert 0 < many_runs.available_memory_mb() <= total_mb * 1.01
+    assert 0 < memory.available_memory_mb() <= total_mb * 1.01
+
+
+def test_a_container_has_what_its_limit_leaves_and_files_that_can_go(tmp_path):
+    assert container_memory_mb(tmp_path) is None
+    (tmp_path / "memory.current").write_text(f"{300 * 2**20}\n")
+    (tmp_path / "memory.stat").write_text(f"anon 5\ninactive_file {100 * 2**20}\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    assert container_memory_mb(tmp_path) is None
+    (tmp_path / "memory.max").write_text(f"{1000 * 2**20}\n")
+    assert container_memory_mb(tmp_path) == 800

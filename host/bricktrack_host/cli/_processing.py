@@ -1,0 +1,340 @@
+"""Runs processed by workers, here or on a cluster: bars meanwhile, and a word on each as it ends."""
+
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from bricktrack_common.errors import BricktrackError, ConfigError
+from bricktrack_host.cli._console import err, out, say_error
+
+# What computes is imported where it is used: `--help` and the units' commands need none of it.
+if TYPE_CHECKING:
+    from bricktrack_host.many_runs.dask_cluster import TlsFiles
+    from bricktrack_host.many_runs.run_job import RunJob, RunSummary
+    from bricktrack_host.many_runs.workers import Instead, Workers
+    from bricktrack_host.pipeline import ProcessedRun
+    from bricktrack_host.results.truth import TruthComparison
+
+_PIPELINE = "bricktrack_host.many_runs.run_job"
+
+Send = Literal["auto", "path", "bytes"]
+JobsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--jobs", "-j", min=1, help="Runs at once. \\[default: as processors and free memory allow]"
+    ),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        help="Have a Dask cluster process the runs: its scheduler, as tcp://10.0.0.5:8786.",
+        rich_help_panel="Cluster",
+    ),
+]
+SendOption = Annotated[
+    Send,
+    typer.Option(
+        help="Send a worker each run's path, or its files; auto: the files where it does not find the path.",
+        rich_help_panel="Cluster",
+    ),
+]
+TlsAuthorityOption = Annotated[
+    Path | None,
+    typer.Option("--tls-ca", help="For a tls:// scheduler: the authority's file.", rich_help_panel="Cluster"),
+]
+TlsCertificateOption = Annotated[
+    Path | None, typer.Option("--tls-cert", help="... our certificate.", rich_help_panel="Cluster")
+]
+TlsKeyOption = Annotated[
+    Path | None, typer.Option("--tls-key", help="... and its key.", rich_help_panel="Cluster")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Who processes runs: so many processes here, or the workers of a cluster.
+
+    Attributes
+    ----------
+    jobs : int or None
+        Processes here; `None`: as many as processors and memory allow.
+    scheduler : str or None
+        Of a Dask cluster.
+    send : "auto", "path" or "bytes"
+    tls_files : tuple of Path or None
+        Authority, certificate and key.
+    """
+
+    jobs: int | None = None
+    scheduler: str | None = None
+    send: Send = "auto"
+    tls_files: tuple[Path | None, Path | None, Path | None] = (None, None, None)
+
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and self.jobs is not None:
+            raise ConfigError(
+                "--jobs is for this machine; with --scheduler the cluster has as many as workers"
+            )
+        if self.scheduler is None and (self.send != "auto" or any(self.tls_files)):
+            raise ConfigError("--send and --tls-... are for a cluster: give its --scheduler too")
+
+    def workers(self, n_runs: int) -> "Workers":
+        """Return who processes so many runs.
+
+        Raises
+        ------
+        ConfigError
+            If the cluster cannot be reached, or is not fit for it.
+        """
+        if self.scheduler is None:
+            from bricktrack_host.many_runs.local_processes import LocalProcesses
+            from bricktrack_host.many_runs.memory import default_workers
+
+            return LocalProcesses(self.jobs or default_workers(n_runs), preload=[_PIPELINE])
+        from bricktrack_host.many_runs.dask_cluster import DaskCluster
+
+        with err.status(f"asking {self.scheduler} for workers"):
+            return DaskCluster(self.scheduler, tls=self._tls())
+
+    def _tls(self) -> "TlsFiles | None":
+        from bricktrack_host.many_runs.dask_cluster import TlsFiles
+
+        authority, certificate, key = self.tls_files
+        if authority is None and certificate is None and key is None:
+            return None
+        if authority is None or certificate is None or key is None:
+            raise ConfigError("--tls-ca, --tls-cert and --tls-key belong together: give all three")
+        return TlsFiles(authority, certificate, key)
+
+
+class StageBar:
+    """One bar that shows the stage under way and how far it is."""
+
+    def __init__(self, progress: Progress, run_id: str) -> None:
+        self._progress = progress
+        self._run_id = run_id
+        self._task: TaskID = progress.add_task(f"{run_id}: waits for a worker", total=None)
+
+    def stage(self, name: str, total: int | None) -> None:
+        """Show that a stage begins."""
+        self._progress.reset(self._task, total=total, description=f"{self._run_id}: {name}")
+
+    def advance_to(self, done: int) -> None:
+        """Show that so many steps of it are done."""
+        self._progress.update(self._task, completed=done)
+
+    def remove(self) -> None:
+        """Show nothing any more."""
+        self._progress.remove_task(self._task)
+
+
+def _bars() -> Progress:
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    return Progress(*columns, console=err, transient=True)
+
+
+@contextmanager
+def stage_bar(run_id: str) -> Iterator[StageBar]:
+    """Show the progress of one run on the terminal while the block runs."""
+    with _bars() as progress:
+        yield StageBar(progress, run_id)
+
+
+def process_here(job: "RunJob", *, again: bool) -> None:
+    """Process one run in this process, and say what came of it.
+
+    Raises
+    ------
+    BricktrackError
+        If it cannot be processed.
+    """
+    from bricktrack_host.many_runs.run_job import is_processed, process_job
+
+    key = job.input_sha256()
+    if not again and is_processed(job, key):
+        say_stands([job])
+        return
+    with stage_bar(job.run.name) as bar:
+        summary = process_job(job, key, bar)
+    say_summary(summary)
+
+
+def process_side_by_side(
+    runs: list[Path], job_of: "Callable[[Path], RunJob]", where: Where, *, again: bool
+) -> int:
+    """Process runs, say what became of each as it ends, and return how many failed.
+
+    Those whose results are of the same input are left as they are, unless ``again``.
+    """
+    from bricktrack_host.many_runs.run_job import is_processed
+
+    todo: list[tuple[RunJob, str]] = []
+    standing: list[RunJob] = []
+    n_failed = 0
+    for run in dict.fromkeys(runs):
+        try:
+            job = job_of(run)
+            key = job.input_sha256()
+        except BricktrackError as e:
+            n_failed += 1
+            say_error(f"{run}: {e}")
+            continue
+        if not again and is_processed(job, key):
+            standing.append(job)
+        else:
+            todo.append((job, key))
+    if standing:
+        say_stands(standing)
+    return n_failed + (_process(todo, where) if todo else 0)
+
+
+def _process(todo: "list[tuple[RunJob, str]]", where: Where) -> int:
+    from bricktrack_host.many_runs.workers import do_all
+
+    handling: _Here | _Sent = _Here(todo) if where.scheduler is None else _Sent(todo, where.send)
+    workers = where.workers(len(todo))
+    bars: dict[int, StageBar] = {}
+    n_failed = 0
+    with _bars() as progress:
+        everything = progress.add_task("all runs", total=len(todo)) if len(todo) > 1 else None
+
+        def begin(i: int) -> StageBar:
+            if i not in bars:
+                bars[i] = StageBar(progress, todo[i][0].run.name)
+            return bars[i]
+
+        outcomes = do_all(len(todo), handling.work, workers, progress=begin, finish=handling.finish)
+        with closing(outcomes):
+            for outcome in outcomes:
+                if outcome.index in bars:
+                    bars.pop(outcome.index).remove()
+                if everything is not None:
+                    progress.advance(everything)
+                if outcome.value is not None:
+                    say_summary(outcome.value, budget=False)
+                    continue
+                n_failed += 1
+                if outcome.is_bug:
+                    err.print(outcome.failure, markup=False, soft_wrap=True)
+                run = todo[outcome.index][0].run
+                say_error(f"{run}: {'a bug, see above' if outcome.is_bug else outcome.failure}")
+    return n_failed
+
+
+class _Here:
+    """Runs processed by processes of this machine, which write the results themselves."""
+
+    def __init__(self, todo: "list[tuple[RunJob, str]]") -> None:
+        self._todo = todo
+
+    def work(self, i: int) -> Callable[..., Any]:
+        from bricktrack_host.many_runs.run_job import process_job
+
+        return partial(process_job, *self._todo[i])
+
+    def finish(self, i: int, summary: "RunSummary") -> "RunSummary":
+        return summary
+
+
+class _Sent:
+    """Runs sent to other machines, whose results are written here."""
+
+    def __init__(self, todo: "list[tuple[RunJob, str]]", send: Send) -> None:
+        self._todo = todo
+        self._send = send
+
+    def work(self, i: int) -> Callable[..., Any]:
+        return self._parcel(i, as_bytes=self._send == "bytes")
+
+    def _parcel(self, i: int, *, as_bytes: bool) -> Callable[..., Any]:
+        from bricktrack_host.many_runs.shipped_run import pack, process_parcel
+
+        return partial(process_parcel, pack(self._todo[i][0], as_bytes=as_bytes))
+
+    def finish(self, i: int, came: Any) -> "RunSummary | Instead[Any]":
+        from bricktrack_host.many_runs.shipped_run import NotThere, publish
+        from bricktrack_host.many_runs.workers import Instead
+
+        job, key = self._todo[i]
+        if not isinstance(came, NotThere):
+            return publish(job, key, came)
+        if self._send == "path":
+            raise ConfigError(
+                f"the worker does not find this run at {job.run.resolve()}. Share that folder with it, or "
+                "give --send bytes"
+            )
+        return Instead(self._parcel(i, as_bytes=True))
+
+
+def say_stands(jobs: "list[RunJob]") -> None:
+    """Say that results of before stand, because they are of the same input."""
+    if len(jobs) > 1:
+        out.print(f"{len(jobs)} runs are processed already, of the same input; --again does them anew")
+        return
+    out.print(
+        f"{jobs[0].run.name}: processed already, of the same input; --again does it anew",
+        markup=False,
+        soft_wrap=True,
+    )
+    out.print(f"results: {jobs[0].results}", markup=False, soft_wrap=True)
+
+
+def say_processed(processed: "ProcessedRun", *, budget: bool = True) -> None:
+    """Print what a processed run came to."""
+    from bricktrack_host.many_runs.run_job import summarise
+
+    say_summary(summarise(processed), budget=budget)
+
+
+def say_summary(summary: "RunSummary", *, budget: bool = True) -> None:
+    """Print the verdict and where it all is; with ``budget`` the times and the errors against truth too."""
+    out.print(f"{summary.run_id}: {summary.verdict}", markup=False, soft_wrap=True)
+    for problem in summary.problems:
+        out.print(f"  {problem}", style="yellow", markup=False, soft_wrap=True)
+    if budget:
+        say_truth(summary.truth)
+        _say_budget(summary.timings_s, summary.n_frames)
+    out.print(f"results: {summary.folder}", markup=False, soft_wrap=True)
+    out.print(f"report:  {summary.report}", markup=False, soft_wrap=True)
+    if summary.earlier is not None:
+        out.print(
+            f"earlier: {summary.earlier} (kept; what changed: 'bricktrack compare {summary.folder.parent}')",
+            markup=False,
+            soft_wrap=True,
+        )
+
+
+def _say_budget(timings_s: dict[str, float], n_frames: int) -> None:
+    table = Table(title="Time budget")
+    table.add_column("stage")
+    table.add_column("s", justify="right")
+    table.add_column("ms a frame", justify="right")
+    for name, seconds in timings_s.items():
+        table.add_row(name, f"{seconds:.2f}", f"{1000 * seconds / n_frames:.2f}")
+    total = sum(timings_s.values())
+    table.add_row("all", f"{total:.2f}", f"{1000 * total / n_frames:.2f}", style="bold")
+    out.print(table)
+
+
+def say_truth(comparison: "TruthComparison | None") -> None:
+    """Print the errors against simulated truth, absolute and as displacements from rest."""
+    from bricktrack_host.results.truth import comparison_table
+
+    if comparison is None:
+        return
+    out.print(comparison_table(comparison))
+    if comparison.from_rest:
+        out.print(comparison_table(comparison, from_rest=True))

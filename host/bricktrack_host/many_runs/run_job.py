@@ -1,0 +1,125 @@
+"""One run to be processed: what it needs, whether that was done already, and what came of it in words."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from bricktrack_host.many_runs.processing_record import (
+    ProcessingRecord,
+    Stopwatch,
+    Took,
+    input_sha256,
+    read_record,
+    write_record,
+)
+from bricktrack_host.many_runs.workers import RunProgress
+from bricktrack_host.pipeline import ProcessedRun, ProcessSettings, find_truth, process_run
+from bricktrack_host.results.result_store import RESULTS_FOLDER, SUMMARY_NAME
+from bricktrack_host.results.run_summary import key_figures, verdict
+from bricktrack_host.results.truth import TruthComparison
+
+
+@dataclass(frozen=True, slots=True)
+class RunJob:
+    """A run, what belongs to its unit, and how to process it; see `pipeline.process_run`."""
+
+    run: Path
+    calibration: Path
+    layout: Path
+    settings: ProcessSettings
+    output: Path | None = None
+    truth: Path | None = None
+
+    @property
+    def results(self) -> Path:
+        """Return the folder that the results are for."""
+        return self.output or self.run / RESULTS_FOLDER
+
+    def truth_file(self) -> Path | None:
+        """Return the file of true motion that this run is compared with, if there is one.
+
+        Raises
+        ------
+        ConfigError
+            If one was named and is not there.
+        """
+        return find_truth(self.run, self.truth)
+
+    def input_sha256(self) -> str:
+        """Return a hash of everything that the results depend on; see `processing_record.input_sha256`."""
+        files = {"calibration": self.calibration, "layout": self.layout, "truth": self.truth_file()}
+        return input_sha256(self.run, files, self.settings)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunSummary:
+    """What processing a run came to, in words and figures small enough to be sent.
+
+    Attributes
+    ----------
+    verdict : str
+    problems : tuple of str
+    truth : TruthComparison or None
+        Without its series.
+    n_frames : int
+    timings_s : dict
+        Wall time of each stage.
+    folder, report : Path
+        Of the results.
+    earlier : Path or None
+        Where results that said something else are kept.
+    took : Took or None
+    """
+
+    run_id: str
+    verdict: str
+    problems: tuple[str, ...]
+    truth: TruthComparison | None
+    n_frames: int
+    timings_s: dict[str, float]
+    folder: Path
+    report: Path
+    earlier: Path | None = None
+    took: Took | None = None
+
+
+def summarise(processed: ProcessedRun) -> RunSummary:
+    """Return what a processed run came to."""
+    result = processed.result
+    words, problems = verdict(result, key_figures(result))
+    return RunSummary(
+        run_id=result.manifest.run_id,
+        verdict=words,
+        problems=tuple(problems),
+        truth=None if processed.truth is None else replace(processed.truth, series={}),
+        n_frames=len(result.optical.t_ns),
+        timings_s=dict(result.timings_s),
+        folder=processed.folder,
+        report=processed.report,
+        earlier=processed.earlier,
+    )
+
+
+def process_job(job: RunJob, input_sha256: str, progress: RunProgress) -> RunSummary:
+    """Process a run into its results folder, and note there of what the results were made.
+
+    Raises
+    ------
+    BricktrackError
+        As `pipeline.process_run`.
+    """
+    watch = Stopwatch()
+    processed = process_run(
+        job.run, calibration=job.calibration, layout=job.layout, output=job.output, settings=job.settings,
+        truth=job.truth, progress=progress,
+    )  # fmt: skip
+    took = watch.read()
+    write_record(processed.folder, ProcessingRecord(input_sha256=input_sha256, took=took))
+    return replace(summarise(processed), took=took)
+
+
+def is_processed(job: RunJob, input_sha256: str) -> bool:
+    """Tell whether a run's results are there, and were made of just this input."""
+    record = read_record(job.results)
+    return (
+        record is not None and record.input_sha256 == input_sha256 and (job.results / SUMMARY_NAME).is_file()
+    )
