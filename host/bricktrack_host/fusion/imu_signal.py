@@ -15,15 +15,14 @@ from scipy.ndimage import maximum_filter1d
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag
-from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.compiled import compiled
 from bricktrack_host.fusion.running_median import running_median
+from bricktrack_host.fusion.signal_kernel import SignalPieces, integrate_steps
 from bricktrack_host.tracks import ImuTrack
 
 MIN_SAMPLES = 20
 _GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
 _BRIDGE_PERIODS = 3.5  # up to here the cubic may bridge it; beyond, a straight line
-_SUBSTEPS = 4  # of at most 2.5 ms at 100 Hz: cubic signal, exact integrals, coning left below 1e-8 rad
 # sd of (sample - polynomial through eight neighbours) over sd of one sample, white noise
 _PREDICTION_GAIN = comb(16, 8) ** 0.5 / comb(8, 4)
 _STEADY_SAMPLES = 25
@@ -320,40 +319,36 @@ class ImuSignal:
         acc_lag_s : float
             Specific force at t is the sample stamped t + this (DESIGN 8.2).
         """
-        bg = np.broadcast_to(gyro_bias_radps, (len(start_s), 3))
-        ba = np.broadcast_to(acc_bias_mps2, (len(start_s), 3))
-        dt = (end_s - start_s)[:, None]
-        # Rows: instants; columns: the ends and middles of the sub-steps.
-        grid = start_s[:, None] + dt * np.linspace(0.0, 1.0, 2 * _SUBSTEPS + 1)
-        angle = self.angle_at(grid)
-        angle = angle - angle[:, :1] - bg[:, None] * (grid - grid[:, :1])[..., None]
-        h = dt / _SUBSTEPS
-        ends = grid[:, ::2] + acc_lag_s
-        held = self._held(ends)
-        beyond, force = (ends - held)[..., None], self.acc_at(ends)
-        once, twice = np.asarray(self._acc_integral(held)), np.asarray(self._acc_double(held))
-        # Held constant beyond the samples, and integrated so.
-        twice = twice + once * beyond + 0.5 * force * beyond**2
-        once = once + force * beyond
-        velocity = np.diff(once, axis=1) - ba[:, None] * h[..., None]
-        shift = np.diff(twice, axis=1) - once[:, :-1] * h[..., None] - 0.5 * ba[:, None] * h[..., None] ** 2
+        n = len(start_s)
+        out = Increments(
+            R=np.empty((n, 3, 3)),
+            dv_mps=np.empty((n, 3)),
+            dp_m=np.empty((n, 3)),
+            R_half=np.empty((n, 3, 3)),
+            f_rate_mps3=np.empty((n, 3)),
+            f_curve_mps4=np.empty((n, 3)),
+        )
+        integrate_steps(
+            self._pieces(),
+            np.ascontiguousarray(start_s),
+            np.ascontiguousarray(end_s),
+            np.ascontiguousarray(np.broadcast_to(gyro_bias_radps, (n, 3))),
+            np.ascontiguousarray(np.broadcast_to(acc_bias_mps2, (n, 3))),
+            float(acc_lag_s),
+            out.R, out.dv_mps, out.dp_m, out.R_half, out.f_rate_mps3, out.f_curve_mps4,
+        )  # fmt: skip
+        return out
 
-        R = np.broadcast_to(np.eye(3), (len(start_s), 3, 3))
-        R_half = R
-        dv, dp = np.zeros((len(start_s), 3)), np.zeros((len(start_s), 3))
-        half = matrix_from_rvec(np.diff(angle, axis=1))  # rotations over half sub-steps
-        for i in range(_SUBSTEPS):
-            turned = R @ half[:, 2 * i]
-            dp = dp + dv * h + np.einsum("nij,nj->ni", turned, shift[:, i])
-            dv = dv + np.einsum("nij,nj->ni", turned, velocity[:, i])
-            R = R @ half[:, 2 * i] @ half[:, 2 * i + 1]
-            if 2 * (i + 1) == _SUBSTEPS:
-                R_half = R
-        safe = np.where(dt == 0, 1.0, dt)
-        rate = np.where(dt == 0, 0.0, (force[:, -1] - force[:, 0]) / safe)
-        slope = np.asarray(self._acc(held, 1))
-        curve = np.where(dt == 0, 0.0, (slope[:, -1] - slope[:, 0]) / safe)
-        return Increments(R=R, dv_mps=dv, dp_m=dp, R_half=R_half, f_rate_mps3=rate, f_curve_mps4=curve)
+    def _pieces(self) -> SignalPieces:
+        return SignalPieces(
+            knots_s=self._gyro.x,
+            span_s=(float(self.t_s[0]), float(self.t_s[-1])),
+            angle=self._gyro_integral.c,
+            gyro=self._gyro.c,
+            acc_twice=self._acc_double.c,
+            acc_once=self._acc_integral.c,
+            acc=self._acc.c,
+        )
 
 
 @compiled

@@ -11,6 +11,11 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.compiled import compiled
+from bricktrack_host.fusion.rotation_kernel import (
+    orthonormalise,
+    turn_by,
+    write_rotation_vector,
+)
 
 N = 22
 M = 9  # attitude, position, velocity
@@ -58,87 +63,6 @@ class LedArrays(NamedTuple):
     cov_px2: FloatArray
     nis: FloatArray
     inflation: FloatArray
-
-
-@compiled
-def _rotation(v: Any, out: Any) -> None:
-    """Write Exp of a rotation vector."""
-    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    if a2 < 1e-8:
-        s, c = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0
-    else:
-        a = np.sqrt(a2)
-        s, c = np.sin(a) / a, (1.0 - np.cos(a)) / a2
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = c * v[i] * v[j]
-        out[i, i] += 1.0 - c * a2
-    out[0, 1] -= s * v[2]
-    out[0, 2] += s * v[1]
-    out[1, 0] += s * v[2]
-    out[1, 2] -= s * v[0]
-    out[2, 0] -= s * v[1]
-    out[2, 1] += s * v[0]
-
-
-@compiled
-def _rotation_vector(A: Any, B: Any, out: Any) -> None:
-    """Write Log of A^T B, by the quaternion: good for every angle."""
-    C = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            C[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
-    trace = C[0, 0] + C[1, 1] + C[2, 2]
-    q = np.zeros(4)
-    i = 0
-    if trace > 0:
-        q[0] = 1 + trace
-        q[1], q[2], q[3] = C[2, 1] - C[1, 2], C[0, 2] - C[2, 0], C[1, 0] - C[0, 1]
-    else:
-        if C[1, 1] > C[0, 0]:
-            i = 1
-        if C[2, 2] > C[i, i]:
-            i = 2
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q[1 + i] = 1 + C[i, i] - C[j, j] - C[k, k]
-        q[0] = C[k, j] - C[j, k]
-        q[1 + j], q[1 + k] = C[j, i] + C[i, j], C[k, i] + C[i, k]
-    norm = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    sign = 1.0 if q[0] >= 0 else -1.0
-    s = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2) / norm
-    w = sign * q[0] / norm
-    gain = 2.0 + s * s / 3.0 if s < 1e-4 else 2.0 * np.arctan2(s, w) / s
-    for i in range(3):
-        out[i] = gain * sign * q[1 + i] / norm
-
-
-@compiled
-def _turn_by(R: Any, v: Any) -> None:
-    """Replace R by R Exp(v)."""
-    E = np.empty((3, 3))
-    _rotation(v, E)
-    row = np.empty(3)
-    for i in range(3):
-        for j in range(3):
-            row[j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
-        for j in range(3):
-            R[i, j] = row[j]
-
-
-@compiled
-def _orthonormal(R: Any) -> None:
-    """Take one Newton step back to a rotation."""
-    S = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            S[i, j] = -0.5 * (R[0, i] * R[0, j] + R[1, i] * R[1, j] + R[2, i] * R[2, j])
-        S[i, i] += 1.5
-    row = np.empty(3)
-    for i in range(3):
-        for j in range(3):
-            row[j] = R[i, 0] * S[0, j] + R[i, 1] * S[1, j] + R[i, 2] * S[2, j]
-        for j in range(3):
-            R[i, j] = row[j]
 
 
 @compiled
@@ -223,7 +147,7 @@ def _move(
         R[i, 0] = row[0] + row[1] * turn[2] - row[2] * turn[1]
         R[i, 1] = row[1] + row[2] * turn[0] - row[0] * turn[2]
         R[i, 2] = row[2] + row[0] * turn[1] - row[1] * turn[0]
-    _orthonormal(R)
+    orthonormalise(R)
 
 
 @compiled
@@ -300,7 +224,7 @@ def _correct(H: Any, C: Any, y: Any, n: int, chi2_95: float, R: Any, x: Any, P: 
             w = HP[i, r]
             for j in range(N):
                 P[r, j] -= w * HP[i, j]
-    _turn_by(R, dx[:3])
+    turn_by(R, dx[:3])
     for j in range(3, N):
         x[j] += dx[j]
     return nis, log_det, inflation
@@ -345,8 +269,8 @@ def _observe_pose(
         H[3 + i, 18], H[3 + i, 19] = v, v * since
         y[3 + i] = p_seen[i] - (x[3 + i] - R[i, 0] * arm[0] - R[i, 1] * arm[1] - R[i, 2] * arm[2] + v * dt)
     ahead = R.copy()
-    _turn_by(ahead, turn * dt)
-    _rotation_vector(ahead, R_seen, y[:3])
+    turn_by(ahead, turn * dt)
+    write_rotation_vector(ahead, R_seen, y[:3])
 
 
 @compiled
@@ -377,7 +301,7 @@ def observe_led(
             Ri[i, j] = R[i, 0] * step[0, j] + R[i, 1] * step[1, j] + R[i, 2] * step[2, j]
         turn[i] = -dt * (x[9 + i] - bg_lin[i])
         w[i] = leds.omega_radps[m, i] - x[9 + i]
-    _turn_by(Ri, turn)
+    turn_by(Ri, turn)
     swing = np.empty(3)  # velocity of the origin less that of the IMU, body axes
     swing[0] = -(w[1] * arm[2] - w[2] * arm[1])
     swing[1] = -(w[2] * arm[0] - w[0] * arm[2])
@@ -409,8 +333,8 @@ def observe_led(
             H6[3 + i, j] += a0 * step[j, 0] + a1 * step[j, 1] + a2 * step[j, 2]
             H6[3 + i, 12 + j] = -0.5 * dt * dt * R[i, j]
         H6[3 + i, 9], H6[3 + i, 10], H6[3 + i, 11] = -dt * a0, -dt * a1, -dt * a2
-    _turn_by(Ri, w * ahead)
-    _rotation_vector(leds.R_lin[m], Ri, off[:3])
+    turn_by(Ri, w * ahead)
+    write_rotation_vector(leds.R_lin[m], Ri, off[:3])
     for i in range(2):
         s = leds.residual_px[m, i]
         for j in range(6):
@@ -612,7 +536,7 @@ def backward_pass(
                 B[i, j] *= scale[i]
                 D[i, j] = P_out[k + 1, b, i, j] - pred[i, j]
             d[i] = x_out[k + 1, b, i] - x_pred[k + 1, b, i]
-        _rotation_vector(R_pred[k + 1, b], R_out[k + 1, b], turn)
+        write_rotation_vector(R_pred[k + 1, b], R_out[k + 1, b], turn)
         for i in range(3):
             d[i] = turn[i]
         after = P_out[k, b]
@@ -646,4 +570,4 @@ def backward_pass(
         for i in range(3):
             for j in range(3):
                 R_out[k, b, i, j] = R_kept[k, b, i, j]
-        _turn_by(R_out[k, b], turn)
+        turn_by(R_out[k, b], turn)
