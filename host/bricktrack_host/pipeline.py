@@ -123,15 +123,15 @@ def process_run(
     with stages("align clocks"):
         edge_fit = fit_square_wave(run, problems)
         imu = choose_imu(run, brick, settings, problems)
-        alignment = None if imu is None else align(optical, imu, run, settings, problems)
-        rest = rest_pose(optical, imu, alignment, problems)
+        inertial = None if imu is None else align(optical, imu, run, edge_fit, settings, problems)
+        rest = rest_pose(optical, inertial, problems)
     with stages("fuse"):
         if settings.rolling_shutter:
-            optical = retime(observations, first, optical, imu, alignment, rays.ray_model, brick)
+            optical = retime(observations, first, optical, inertial, rays.ray_model, brick)
             _require_poses(optical, run, brick)
-        grid = output_grid(optical, imu, alignment, edge_fit)
+        grid = output_grid(optical, inertial, edge_fit)
         seen = (observations, rays.ray_model) if settings.rolling_shutter else None
-        fused, fusion = fuse_run(optical, imu, alignment, brick, grid, problems, seen=seen)
+        fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
     result = RunResult(
         manifest=run.manifest,
         led_names=brick.led_names,
@@ -142,7 +142,7 @@ def process_run(
         edge_fit=edge_fit,
         imu=imu,
         rest=rest,
-        alignment=alignment_details(alignment, fusion),
+        alignment=alignment_details(inertial, fusion),
         calibration=calibration_details(rays),
         problems=tuple(problems),
         provenance=Provenance(

@@ -20,7 +20,13 @@ from bricktrack_host.fusion.camera_delay import settle_delay
 from bricktrack_host.fusion.fused_output import common_part, sample_motion
 from bricktrack_host.fusion.fusion_problem import NoiseLevel, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE, CameraImu, CameraMotion, align_both
+from bricktrack_host.fusion.moving_camera import (
+    NOT_OBSERVABLE,
+    CameraAlignment,
+    CameraImu,
+    CameraMotion,
+    align_both,
+)
 from bricktrack_host.fusion.pose_level import Smoothed, smooth_poses
 from bricktrack_host.fusion.smoother import BA, BG, GRAV, LAG, LOSS, SKEW, TAU, Estimate
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
@@ -109,6 +115,8 @@ class FusionInput:
         Estimated by `align_times` when not given; not where the camera moves, which has two to estimate.
     camera : CameraImu, optional
         The sensor that moves with the camera; none: the camera stands still.
+    camera_alignment : CameraAlignment, optional
+        Of a moving camera; estimated by `align_both` when not given.
     """
 
     optical: OpticalTrack
@@ -117,6 +125,7 @@ class FusionInput:
     output_t_ns: IntArray
     alignment: TimeAlignment | None = None
     camera: CameraImu | None = None
+    camera_alignment: CameraAlignment | None = None
 
 
 def fuse(
@@ -128,6 +137,7 @@ def fuse(
     alignment: TimeAlignment | None = None,
     camera: CameraMotionKind = "static",
     camera_imu: CameraImu | None = None,
+    camera_alignment: CameraAlignment | None = None,
     settings: FusionSettings | None = None,
     with_forward: bool = False,
 ) -> FusionResult:
@@ -149,6 +159,8 @@ def fuse(
         are recorded.
     camera_imu : CameraImu, optional
         That sensor, where the camera moves.
+    camera_alignment : CameraAlignment, optional
+        In place of ``alignment`` where the camera moves; estimated by `align_both` when not given.
     settings : FusionSettings, optional
     with_forward : bool
         Whether to give the forward filter's motion too.
@@ -167,7 +179,7 @@ def fuse(
         If there are too few inertial samples, or arrays do not fit together.
     """
     require_observable(camera, camera_imu)
-    one = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment, camera_imu)
+    one = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment, camera_imu, camera_alignment)
     return fuse_batch([one], settings=settings, with_forward=with_forward)[0]
 
 
@@ -221,7 +233,7 @@ def prepare_run(item: FusionInput, settings: FusionSettings) -> Run:
     if item.camera is None:
         alignment, motion, is_near = item.alignment or align_times(item.optical, item.imu), None, True
     else:
-        both = align_both(item.optical, item.imu, item.camera)
+        both = item.camera_alignment or align_both(item.optical, item.imu, item.camera)
         alignment, motion = both.brick, both.motion
         is_near = "stamps" not in (both.brick.source, both.camera.source)
     imu = item.imu if alignment.sample_clock is None else alignment.sample_clock.restamp(item.imu)

@@ -194,7 +194,12 @@ class CameraAlignment:
 
 
 def align_both(
-    optical: OpticalTrack, imu: ImuTrack, camera: CameraImu, *, max_offset_s: float = 0.25
+    optical: OpticalTrack,
+    imu: ImuTrack,
+    camera: CameraImu,
+    *,
+    max_offset_s: float = 0.25,
+    prior_sd_ns: float = 5e6,
 ) -> CameraAlignment:
     """Return how camera time maps to the time of both sensors, from the rotations that all saw.
 
@@ -207,10 +212,16 @@ def align_both(
     b: TimeAlignment | None = None
     for _ in range(_ALIGN_ROUNDS):
         before = b
-        b = align_times(_without(optical, camera.imu, a, is_camera=True), imu, max_offset_s=max_offset_s)
+        b = align_times(
+            _without(optical, camera.imu, a, is_camera=True), imu,
+            max_offset_s=max_offset_s, prior_sd_ns=prior_sd_ns,
+        )  # fmt: skip
         if camera.kind == "table":
             break
-        a = align_times(_without(optical, imu, b, is_camera=False), camera.imu, max_offset_s=max_offset_s)
+        a = align_times(
+            _without(optical, imu, b, is_camera=False), camera.imu,
+            max_offset_s=max_offset_s, prior_sd_ns=prior_sd_ns,
+        )  # fmt: skip
         if before is not None and abs(b.offset_ns - before.offset_ns) < _ALIGNED_NS:
             break
     if b is None:

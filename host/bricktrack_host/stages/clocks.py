@@ -1,16 +1,40 @@
 """The stage of the clocks: square wave, choice of the inertial samples, their alignment, the pose at rest."""
 
+from dataclasses import dataclass
+
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.errors import ConfigError, ShapeError, TrackingError
 from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2, ImuDescription, ImuSamples
 from bricktrack_common.run_folder import Run
-from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE
+from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE, CameraAlignment, CameraImu, align_both
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.results.daq_clock import EdgeFit, EdgeFitError, fit_edges
 from bricktrack_host.results.rest_pose import RestPose, tare
+from bricktrack_host.stages.camera_sensor import read_camera_sensor
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inertial:
+    """The inertial samples to be fused, and how their clocks lie to the camera's.
+
+    Attributes
+    ----------
+    imu : ImuTrack
+        Of the LED component, in brick axes.
+    alignment : TimeAlignment
+    camera : CameraImu or None
+        What feels the motion of a camera that moves.
+    camera_alignment : CameraAlignment or None
+        Of both, there.
+    """
+
+    imu: ImuTrack
+    alignment: TimeAlignment
+    camera: CameraImu | None = None
+    camera_alignment: CameraAlignment | None = None
 
 
 def fit_square_wave(run: Run, problems: list[str]) -> EdgeFit | None:
@@ -30,14 +54,14 @@ def choose_imu(
     """Return the samples of the sensor on the LED component in brick axes, or `None` and why."""
     if not settings.use_imu:
         return None
-    if settings.camera != "static":
-        problems.append(
-            f"the camera moves (camera = {settings.camera!r}): optical poses alone. {NOT_OBSERVABLE}"
-        )
-        return None
     if settings.imu is not None and settings.imu not in run.imus:
         raise ConfigError(f"the run has no IMU '{settings.imu}'; it has: {', '.join(run.imus) or 'none'}")
-    if not run.imus:
+    sensor = settings.camera_sensor
+    cameras = {sensor.imu} if sensor is not None and sensor.kind == "imu" and not sensor.source else set()
+    names = [name for name in run.imus if name not in cameras]
+    if settings.imu in cameras:
+        raise ConfigError(f"IMU '{settings.imu}' moves with the camera; name the one on the LED component")
+    if not names:
         problems.append("no inertial samples: the motion is smoothed from the optical poses alone")
         return None
     if brick.R_brick_imu is None:
@@ -45,7 +69,7 @@ def choose_imu(
             "the layout file has no [imu], so the inertial samples cannot be used; optical poses alone"
         )
         return None
-    description, samples = run.imus[settings.imu or next(iter(run.imus))]
+    description, samples = run.imus[settings.imu or names[0]]
     return imu_in_brick_axes(description, samples, brick.R_brick_imu)
 
 
@@ -61,30 +85,57 @@ def imu_in_brick_axes(description: ImuDescription, samples: ImuSamples, R_brick_
 
 
 def align(
-    optical: OpticalTrack, imu: ImuTrack, run: Run, settings: ProcessSettings, problems: list[str]
-) -> TimeAlignment | None:
-    """Return how camera and IMU clocks lie to each other, or `None` where the samples do not tell."""
+    optical: OpticalTrack,
+    imu: ImuTrack,
+    run: Run,
+    edge_fit: EdgeFit | None,
+    settings: ProcessSettings,
+    problems: list[str],
+) -> Inertial | None:
+    """Return the samples with how camera and IMU clocks lie to each other, or `None` and why not."""
     # The daemon's stamps are of one clock and promise milliseconds; recordings from elsewhere nothing.
-    prior_sd_ns = 5e6 if run.manifest.origin == "bricktrackd" else settings.max_clock_offset_s * 1e9
+    within_s = settings.max_clock_offset_s
+    prior_sd_ns = 5e6 if run.manifest.origin == "bricktrackd" else within_s * 1e9
+    camera = None
+    if settings.camera != "static":
+        sensor = settings.camera_sensor
+        camera = None if sensor is None else read_camera_sensor(run, sensor, edge_fit, problems)
+        if camera is None:
+            problems.append(
+                f"the camera moves (camera = {settings.camera!r}): optical poses alone. {NOT_OBSERVABLE}"
+            )
+            return None
+        if camera.kind != settings.camera:
+            raise ConfigError(
+                f"camera = {settings.camera!r}, but the sensor given with the camera is of {camera.kind!r}"
+            )
     try:
-        alignment = align_times(
-            optical, imu, max_offset_s=settings.max_clock_offset_s, prior_sd_ns=prior_sd_ns
-        )
+        if camera is not None:
+            both = align_both(optical, imu, camera, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
+            inertial = Inertial(imu, both.brick, camera, both)
+        else:
+            inertial = Inertial(
+                imu, align_times(optical, imu, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
+            )
     except ShapeError as e:
         problems.append(f"the inertial samples cannot be used: {e}")
         return None
-    if alignment.reason:
-        problems.append(f"time alignment of camera and IMU: {alignment.reason}")
-    return alignment
+    if inertial.alignment.reason:
+        problems.append(f"time alignment of camera and IMU: {inertial.alignment.reason}")
+    if inertial.camera_alignment is not None and inertial.camera_alignment.camera.reason:
+        problems.append(
+            "time alignment of the camera and the IMU that moves with it: "
+            f"{inertial.camera_alignment.camera.reason}"
+        )
+    return inertial
 
 
-def rest_pose(
-    optical: OpticalTrack, imu: ImuTrack | None, alignment: TimeAlignment | None, problems: list[str]
-) -> RestPose | None:
+def rest_pose(optical: OpticalTrack, inertial: Inertial | None, problems: list[str]) -> RestPose | None:
     """Return the pose before the shaking began, or `None` and why."""
-    offset_ns = 0 if alignment is None else round(alignment.offset_ns)
+    offset_ns = 0 if inertial is None else round(inertial.alignment.offset_ns)
+    imu = None if inertial is None else inertial.imu
     try:
-        return tare(optical, imu if alignment is not None else None, imu_minus_camera_ns=offset_ns)
+        return tare(optical, imu, imu_minus_camera_ns=offset_ns)
     except TrackingError as e:
         problems.append(f"no rest pose, so no displacements from rest: {e}")
         return None

@@ -4,15 +4,16 @@ import numpy as np
 
 from bricktrack_host.calibration.calibration_file import Calibration, CentralRaysRecord
 from bricktrack_host.fusion.estimate import FusionResult
-from bricktrack_host.fusion.time_alignment import TimeAlignment
 from bricktrack_host.reporting.plots import CalibrationPicture
 from bricktrack_host.results.result_store import Details
+from bricktrack_host.stages.clocks import Inertial
 
 
-def alignment_details(alignment: TimeAlignment | None, fusion: FusionResult | None) -> Details:
+def alignment_details(inertial: Inertial | None, fusion: FusionResult | None) -> Details:
     """Return what the results say about the clocks, and what the fusion learned besides."""
-    if alignment is None:
+    if inertial is None:
         return {"method": "none: no inertial samples were used"}
+    alignment = inertial.alignment
     details: Details = {
         "method": "motion" if alignment.source == "data" else "stamps",
         "offset_ms": alignment.offset_ns / 1e6,
@@ -22,6 +23,14 @@ def alignment_details(alignment: TimeAlignment | None, fusion: FusionResult | No
         "correlation": alignment.correlation,
         "trusted": alignment.is_trusted,
     }
+    if inertial.camera_alignment is not None:
+        own = inertial.camera_alignment.camera
+        details |= {
+            "camera_sensor": inertial.camera_alignment.motion.kind,
+            "camera_sensor_offset_ms": own.offset_ns / 1e6,
+            "camera_sensor_offset_sd_ms": own.offset_sd_ns / 1e6,
+            "camera_sensor_method": "motion" if own.source == "data" else "stamps",
+        }
     if fusion is not None:
         details |= {
             "smoothed_offset_ms": fusion.offset_ns / 1e6,

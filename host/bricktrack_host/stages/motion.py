@@ -11,12 +11,12 @@ from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.tight import fuse_tight
-from bricktrack_host.fusion.time_alignment import TimeAlignment
 from bricktrack_host.results.daq_clock import EdgeFit
 from bricktrack_host.results.result_tables import FusedKind
+from bricktrack_host.stages.clocks import Inertial
 from bricktrack_host.tracking.first_poses import FirstPoses
 from bricktrack_host.tracking.optical_track import led_motion, solve_poses
-from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
+from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1
 
@@ -29,13 +29,12 @@ class OutputGrid:
     edge_index: IntArray
 
 
-def output_grid(
-    optical: OpticalTrack, imu: ImuTrack | None, alignment: TimeAlignment | None, edge_fit: EdgeFit | None
-) -> OutputGrid:
+def output_grid(optical: OpticalTrack, inertial: Inertial | None, edge_fit: EdgeFit | None) -> OutputGrid:
     """Return every IMU slot, frame and sample of the square wave from the first frame to the last."""
     first, last = int(optical.t_ns[0]), int(optical.t_ns[-1])
     t_ns: dict[FusedKind, IntArray] = {}
-    if imu is not None and alignment is not None:
+    if inertial is not None:
+        imu, alignment = inertial.imu, inertial.alignment
         # The stamps are IMU time; the offset's own change over it (skew x offset) is below a nanosecond.
         shift_ns = alignment.imu_time_ns(imu.t_ns) - imu.t_ns
         slots = imu.t_ns - shift_ns
@@ -55,8 +54,7 @@ def retime(
     observations: LedObservations,
     first: FirstPoses,
     optical: OpticalTrack,
-    imu: ImuTrack | None,
-    alignment: TimeAlignment | None,
+    inertial: Inertial | None,
     rays: RayModel,
     brick: BrickModel,
 ) -> OpticalTrack:
@@ -65,15 +63,13 @@ def retime(
     Splines through 30 frames a second cannot follow a motion above 15 Hz, and read-out takes 20 ms: the IMU
     knows what the brick did meanwhile.
     """
-    if imu is None or alignment is None or brick.imu_lever_arm_mm is None:
+    if inertial is None or brick.imu_lever_arm_mm is None:
         return optical
     n = len(optical.t_ns)
     for _ in range(_RETIME_PASSES):
         wanted = np.concatenate([optical.t_ns, optical.led_t_ns.ravel()])
         try:
-            track = fuse(
-                optical, imu, lever_arm_mm=brick.imu_lever_arm_mm, output_t_ns=wanted, alignment=alignment
-            ).track
+            track = _by_poses(optical, inertial, brick.imu_lever_arm_mm, wanted).track
         except (ShapeError, TrackingError):
             return optical  # the fusion itself will say why
         motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)))
@@ -83,10 +79,19 @@ def retime(
     return optical
 
 
+def _by_poses(
+    optical: OpticalTrack, inertial: Inertial, lever_arm_mm: FloatArray, wanted: IntArray
+) -> FusionResult:
+    return fuse(
+        optical, inertial.imu, lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=inertial.alignment,
+        camera="static" if inertial.camera is None else inertial.camera.kind,
+        camera_imu=inertial.camera, camera_alignment=inertial.camera_alignment,
+    )  # fmt: skip
+
+
 def fuse_run(
     optical: OpticalTrack,
-    imu: ImuTrack | None,
-    alignment: TimeAlignment | None,
+    inertial: Inertial | None,
     brick: BrickModel,
     grid: OutputGrid,
     problems: list[str],
@@ -96,16 +101,14 @@ def fuse_run(
     """Return the motion at the instants wanted: LED by LED where ``seen`` is given, else pose by pose."""
     wanted = np.concatenate(list(grid.t_ns.values()))
     fusion = None
-    if imu is not None and alignment is not None and brick.imu_lever_arm_mm is not None:
+    if inertial is not None and brick.imu_lever_arm_mm is not None:
+        lever_arm_mm = brick.imu_lever_arm_mm
         try:
-            if seen is None:
-                fusion = fuse(
-                    optical, imu, lever_arm_mm=brick.imu_lever_arm_mm, output_t_ns=wanted, alignment=alignment
-                )
+            if seen is None or inertial.camera is not None:
+                fusion = _by_poses(optical, inertial, lever_arm_mm, wanted)
             else:
-                lever_arm_mm = brick.imu_lever_arm_mm
                 fusion = _fuse_tight(
-                    optical, imu, alignment, brick, seen, wanted, problems, lever_arm_mm=lever_arm_mm
+                    optical, inertial, brick, seen, wanted, problems, lever_arm_mm=lever_arm_mm
                 )
         except (ShapeError, TrackingError) as e:
             problems.append(f"fusion was not possible, optical poses alone: {e}")
@@ -128,8 +131,7 @@ def fuse_run(
 
 def _fuse_tight(
     optical: OpticalTrack,
-    imu: ImuTrack,
-    alignment: TimeAlignment,
+    inertial: Inertial,
     brick: BrickModel,
     seen: tuple[LedObservations, RayModel],
     wanted: IntArray,
@@ -139,8 +141,8 @@ def _fuse_tight(
 ) -> FusionResult:
     observations, rays = seen
     tight = fuse_tight(
-        observations, optical, imu, rays, brick,
-        lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=alignment,
+        observations, optical, inertial.imu, rays, brick,
+        lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=inertial.alignment,
     )  # fmt: skip
     n_rejected = int(np.count_nonzero(tight.led_rejected))
     if n_rejected:

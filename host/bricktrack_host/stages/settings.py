@@ -4,7 +4,8 @@ from typing import Literal
 
 import msgspec
 
-from bricktrack_host.transfer.fleet_config import CameraMount
+from bricktrack_host.stages.camera_sensor import CameraSensor
+from bricktrack_host.transfer.camera_config import CameraMount
 
 
 class ProcessSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -23,8 +24,10 @@ class ProcessSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     use_imu : bool
         False: smooth the optical poses alone.
     camera : "static", "imu" or "table"
-        What the camera moves with. Unless it is static the poses are smoothed alone: one sensor on the LED
-        component cannot tell the camera's acceleration from the brick's.
+        What the camera moves with.
+    camera_sensor : CameraSensor or None
+        What feels that motion. A camera that moves without it: the poses are smoothed alone, for one sensor
+        on the LED component cannot tell the camera's acceleration from the brick's.
     max_clock_offset_s : float
         How far apart the stamps of camera and IMU may be: recordings made elsewhere have clocks of their own.
     """
@@ -35,4 +38,5 @@ class ProcessSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     imu: str | None = None
     use_imu: bool = True
     camera: CameraMount = "static"
+    camera_sensor: CameraSensor | None = None
     max_clock_offset_s: float = 0.25

@@ -5,7 +5,7 @@ import math
 import re
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 from urllib.parse import urlsplit
 
 import msgspec
@@ -16,8 +16,12 @@ from bricktrack_common.run_manifest import RUN_ID_PATTERN
 from bricktrack_common.typed_data import load_toml
 from bricktrack_common.wire_messages import HelloReply
 from bricktrack_host.transfer.assembly_config import AssemblyConfig, check_assembly
-
-CameraMount = Literal["static", "imu", "table"]
+from bricktrack_host.transfer.camera_config import (
+    CameraImuEntry,
+    CameraTableEntry,
+    check_camera,
+)
+from bricktrack_host.transfer.camera_config import CameraMount as CameraMount
 
 
 class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -37,6 +41,8 @@ class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         The camera's calibration and the brick's LED layout; ``""`` if not given.
     camera : "static", "imu" or "table"
         What the camera moves with: nothing, a component with its own IMU, or the shaking table.
+    camera_imu, camera_table : CameraImuEntry, CameraTableEntry, optional
+        The sensor that moves with it.
     position_mm : (float, float), mm, optional
         Where it stands in the array's plan, x to the right and y up; only drawings need it.
     """
@@ -47,6 +53,8 @@ class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     calibration: str = ""
     layout: str = ""
     camera: CameraMount = "static"
+    camera_imu: CameraImuEntry | None = None
+    camera_table: CameraTableEntry | None = None
     position_mm: tuple[float, float] | None = None
 
     @property
@@ -129,6 +137,7 @@ def load_fleet(path: Path) -> Fleet:
             check_address(unit.address, where=f"{where}.address")
         if unit.position_mm is not None and not all(math.isfinite(x) for x in unit.position_mm):
             raise ConfigError(f"{where}.position_mm: expected two finite numbers, got {unit.position_mm}")
+        check_camera(unit.camera, unit.camera_imu, unit.camera_table, where=where)
         for key, values in seen.items():
             value = getattr(unit, key)
             if value and value in values:
@@ -149,6 +158,10 @@ def load_fleet(path: Path) -> Fleet:
                 "Make one with 'bricktrack keys create' and name it under [host] as secret_key"
             )
     names = [unit.name for unit in units]
+    for i, unit in enumerate(units):
+        other = unit.camera_imu.unit if unit.camera_imu is not None else ""
+        if other and (other not in names or other == unit.name):
+            raise ConfigError(f"{path}: unit[{i}].camera_imu.unit: {other!r} is no other unit of the fleet")
     for i, assembly in enumerate(fleet.assembly):
         check_assembly(assembly, names, where=f"{path}: assembly[{i}]")
         if [other.name for other in fleet.assembly].count(assembly.name) > 1:
