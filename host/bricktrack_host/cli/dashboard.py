@@ -70,14 +70,14 @@ def dashboard(
     site = Site(host, port, _password(password_file), certificate, private_key)
     site.check()
     chosen = choose_units(fleet, unit, address, timeout_s=timeout)
-    tests_folder = None if chosen.fleet is None else fleet_path(fleet).resolve().parent / "tests"
+    lab = None if chosen.fleet is None else fleet_path(fleet).resolve().parent
 
     def ready(url: str) -> None:
         out.print(f"control page of {len(chosen.units)} units: {url}", markup=False, soft_wrap=True)
         err.print("Ctrl-C ends it; the units stay as they are", style="dim")
 
     serve(
-        site, chosen.units, chosen.dialer, fleet=chosen.fleet, tests_folder=tests_folder, every_s=every,
+        site, chosen.units, chosen.dialer, fleet=chosen.fleet, lab=lab, every_s=every,
         on_ready=ready,
     )  # fmt: skip
 

@@ -16,6 +16,32 @@ class OrderBusyError(UnitError):
     """Another order is under way."""
 
 
+@dataclass(frozen=True, slots=True)
+class OrderLine:
+    """What became of an order at one unit.
+
+    Attributes
+    ----------
+    level : "FAILED", "note", "under way", "waits" or "done"
+    share : float or None
+        For a pull under way: how much of the unit's runs is here, 0 to 1.
+    """
+
+    unit: str
+    level: str
+    words: str
+    share: float | None = None
+
+
+@dataclass(slots=True)
+class Pulled:
+    """How far the pull of one unit is: bytes verified here, and to come in all."""
+
+    n_bytes: int = 0
+    n_bytes_total: int = 0
+    has_its_turn: bool = False
+
+
 @dataclass(slots=True)
 class Order:
     """One order to units, and what came of it so far.
@@ -24,48 +50,81 @@ class Order:
     ----------
     doing : str
         What is done, as "arm shake-07".
+    units : tuple of str
     acknowledged : dict
         The words of each unit that did as it was told.
     refused : dict
         The error of each that did not.
-    n_bytes, n_bytes_total : int
-        For a pull: verified here, and to come in all.
+    notes : list of (unit, words)
+    pulled : dict
+        For a pull: how far each unit is.
     """
 
     doing: str
-    n_units: int
+    units: tuple[str, ...]
     started_s: float = field(default_factory=time.monotonic)
     ended_s: float | None = None
     acknowledged: dict[str, str] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    n_bytes: int = 0
-    n_bytes_total: int = 0
+    notes: list[tuple[str, str]] = field(default_factory=list)
+    pulled: dict[str, Pulled] = field(default_factory=dict)
+
+    @property
+    def n_bytes(self) -> tuple[int, int]:
+        """For a pull: bytes verified here, and to come in all."""
+        pulled = list(self.pulled.values())
+        return sum(p.n_bytes for p in pulled), sum(p.n_bytes_total for p in pulled)
 
     @property
     def share(self) -> float:
         """How much of it is done, 0 to 1."""
+        n_bytes, n_bytes_total = self.n_bytes
         if self.ended_s is not None:
             return 1.0
-        if self.n_bytes_total:
-            return min(self.n_bytes / self.n_bytes_total, 1.0)
-        return (len(self.acknowledged) + len(self.refused)) / max(self.n_units, 1)
+        if n_bytes_total:
+            return min(n_bytes / n_bytes_total, 1.0)
+        return (len(self.acknowledged) + len(self.refused)) / max(len(self.units), 1)
 
     @property
     def words(self) -> str:
         """One line: how far it is."""
-        parts = [f"{self.doing}: {len(self.acknowledged)} of {self.n_units} units acknowledged"]
+        parts = [f"{self.doing}: {len(self.acknowledged)} of {len(self.units)} units acknowledged"]
         if self.refused:
             parts.append(f"{len(self.refused)} failed")
-        if self.n_bytes_total:
+        n_bytes, n_bytes_total = self.n_bytes
+        if n_bytes_total:
             spent_s = max((self.ended_s or time.monotonic()) - self.started_s, 1e-3)
-            parts.append(
-                f"{self.n_bytes / 1e6:.1f} of {self.n_bytes_total / 1e6:.1f} MB, "
-                f"{self.n_bytes / 1e6 / spent_s:.1f} MB/s"
-            )
+            parts.append(f"{_mb(n_bytes, n_bytes_total)}, {n_bytes / 1e6 / spent_s:.1f} MB/s")
         if self.ended_s is None:
             parts.append("under way")
         return ", ".join(parts)
+
+    def lines(self) -> list[OrderLine]:
+        """Return what became of it at each unit: what went wrong first, then what is under way."""
+        found = [OrderLine(unit, "FAILED", words) for unit, words in list(self.refused.items())]
+        found += [OrderLine(unit, "note", words) for unit, words in list(self.notes)]
+        waiting = []
+        for unit in self.units:
+            if unit in self.refused or unit in self.acknowledged or self.ended_s is not None:
+                continue
+            pulled = self.pulled.get(unit)
+            if pulled is None:
+                waiting.append(OrderLine(unit, "waits", ""))
+            elif not pulled.has_its_turn:
+                waiting.append(OrderLine(unit, "waits", f"{pulled.n_bytes_total / 1e6:.1f} MB to come"))
+            else:
+                share = pulled.n_bytes / pulled.n_bytes_total if pulled.n_bytes_total else 0.0
+                words = _mb(pulled.n_bytes, pulled.n_bytes_total)
+                found.append(OrderLine(unit, "under way", words, min(max(share, 0.0), 1.0)))
+        return [
+            *found,
+            *waiting,
+            *(OrderLine(unit, "done", words) for unit, words in list(self.acknowledged.items())),
+        ]
+
+
+def _mb(n_bytes: int, n_bytes_total: int) -> str:
+    return f"{n_bytes / 1e6:.1f} of {n_bytes_total / 1e6:.1f} MB"
 
 
 class OrderDesk:
@@ -155,7 +214,7 @@ class OrderDesk:
         if not self._busy.acquire(blocking=False):
             under_way = self.current.doing if self.current else "an order"
             raise OrderBusyError(f"{under_way!r} is under way. Wait until it is done", code="busy")
-        self.current = Order(doing, len(names))
+        self.current = Order(doing, tuple(names))
         self.touch()
         return self.current
 
@@ -184,15 +243,17 @@ class _PullBoard:
 
     def unit_listed(self, unit: str, n_runs: int, n_bytes: int) -> None:
         with self._lock:
-            self._order.n_bytes_total += n_bytes
+            self._of(unit).n_bytes_total += n_bytes
         self._desk.touch()
 
     def unit_started(self, unit: str) -> None:
-        pass
+        with self._lock:
+            self._of(unit).has_its_turn = True
+        self._desk.touch()
 
     def bytes_done(self, unit: str, n_bytes: int) -> None:
         with self._lock:
-            self._order.n_bytes += n_bytes
+            self._of(unit).n_bytes += n_bytes
         self._desk.touch()
 
     def unit_done(self, unit: str) -> None:
@@ -200,5 +261,8 @@ class _PullBoard:
 
     def note(self, unit: str, text: str) -> None:
         with self._lock:
-            self._order.notes.append(f"{unit}: {text}")
+            self._order.notes.append((unit, text))
         self._desk.touch()
+
+    def _of(self, unit: str) -> Pulled:
+        return self._order.pulled.setdefault(unit, Pulled())

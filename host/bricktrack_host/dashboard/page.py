@@ -2,8 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Sequence
-from html import escape
+from collections.abc import Callable
 from pathlib import Path
 
 from nicegui import events, run, ui
@@ -11,9 +10,11 @@ from nicegui import events, run, ui
 from bricktrack_common.errors import BricktrackError
 from bricktrack_host.campaign.test_plan import NAME_PATTERN
 from bricktrack_host.dashboard.aim_pane import AimPane
+from bricktrack_host.dashboard.checks_pane import ChecksPane
 from bricktrack_host.dashboard.fleet_watch import FleetWatch
 from bricktrack_host.dashboard.last_test_pane import last_test_pane
 from bricktrack_host.dashboard.orders import Order, OrderDesk
+from bricktrack_host.dashboard.orders_pane import OrdersPane
 from bricktrack_host.dashboard.plan import plan_svg, state_css
 from bricktrack_host.dashboard.unit_view import STATES, UnitView
 from bricktrack_host.transfer.fleet_config import UnitConfig
@@ -21,7 +22,8 @@ from bricktrack_host.transfer.fleet_config import UnitConfig
 REFRESH_S = 0.2
 """How often a browser is told what changed."""
 _HERE = Path(__file__).parent
-_MOST_LISTED = 100
+HEARD_EVERY_S = 1.0
+"""How often it is told that the server is there; see ``page.js``."""
 
 
 class ControlPage:
@@ -29,13 +31,11 @@ class ControlPage:
 
     Parameters
     ----------
-    tests_folder : Path or None
-        Where tests are combined; `None` without a fleet file.
+    lab : Path or None
+        Folder of the fleet file; `None` without one.
     """
 
-    def __init__(
-        self, units: list[UnitConfig], watch: FleetWatch, desk: OrderDesk, tests_folder: Path | None
-    ) -> None:
+    def __init__(self, units: list[UnitConfig], watch: FleetWatch, desk: OrderDesk, lab: Path | None) -> None:
         self._units, self._watch, self._desk = units, watch, desk
         self._chosen: list[str] = []
         self._order_version = -1
@@ -46,42 +46,46 @@ class ControlPage:
         # The plan is in the document that is sent, so it is painted before any script has loaded.
         ui.add_body_html(
             '<div id="early"><div class="top"><h1>bricktrack</h1></div><div class="panes">'
-            f'<section class="card">{plan_svg(units, self._views)}</section></div></div>'
+            f'<section class="card">{plan_svg(units, self._views)}</section></div></div>{_BANNER}'
         )
         self._build_top()
         with ui.element("div").classes("panes"):
             with ui.element("section").classes("card"):
                 self._plan = ui.element("div").props("id=plan-slot")
                 self._plan.on("click", self._tile_clicked, js_handler=_TILE_HANDLER)
-                self._plan.on("keydown.enter", self._tile_clicked, js_handler=_TILE_HANDLER)
+                for key in ("keydown.enter", "keydown.space.prevent"):
+                    self._plan.on(key, self._tile_clicked, js_handler=_TILE_HANDLER)
                 self._hint = ui.label().classes("hint")
             with ui.element("section").classes("card"):
-                self._build_tabs(tests_folder)
+                self._build_tabs(lab)
         self._show_counts()
         self._show_chosen()
         ui.run_javascript("bricktrack.adoptPlan()")
         ui.timer(REFRESH_S, self._refresh)
+        ui.timer(HEARD_EVERY_S, lambda: ui.run_javascript("bricktrack.heard()"))
 
     def _build_top(self) -> None:
         with ui.row().classes("top"):
             ui.html("<h1>bricktrack</h1>", sanitize=False)
             self._chips = ui.row().classes("bar")
             ui.space()
-            self._arm_button = ui.button("Arm", icon="sensors", on_click=self._open_arm)
-            self._disarm_button = ui.button("Disarm", icon="stop", on_click=self._disarm_meant).props(
-                "color=grey-8"
-            )
-            self._pull_button = ui.button("Pull runs", icon="download", on_click=self._pull)
-            self._pull_button.props("color=grey-8")
+            with ui.row().classes("bar"):
+                self._arm_button = ui.button("Arm", icon="sensors", on_click=self._open_arm)
+                self._disarm_button = ui.button("Disarm", icon="stop", on_click=self._disarm_meant)
+                self._pull_button = ui.button("Pull runs", icon="download", on_click=self._pull)
+            for button in (self._disarm_button, self._pull_button):
+                button.props("color=grey-8")
             if self._desk.runs_folder is None:
                 self._pull_button.disable()
                 self._pull_button.tooltip("Needs the folder that a fleet file names")
         with ui.row().classes("bar order") as self._order_row:
-            self._order_words = ui.label().classes("order-words")
+            self._order_words = ui.label().classes("order-words").props("role=status")
             self._order_bar = ui.linear_progress(show_value=False).classes("order-bar")
+            self._order_bar.props('aria-label="How much of the order is done"')
         self._order_row.set_visibility(False)
         with ui.dialog() as self._arm_dialog, ui.card():
             self._arm_title = ui.label().classes("big")
+            self._arm_doubt = ui.label().classes("bad")
             self._label = ui.input(
                 "Label of the runs",
                 placeholder="shake-07",
@@ -93,12 +97,13 @@ class ControlPage:
                 ui.button("Cancel", on_click=self._arm_dialog.close).props("flat")
 
         with ui.dialog() as self._disarm_dialog, ui.card():
-            ui.label(f"Disarm all {len(self._units)} units?").classes("big")
+            self._disarm_title = ui.label().classes("big")
+            self._disarm_doubt = ui.label().classes("bad")
             with ui.row():
-                ui.button("Disarm all", on_click=self._disarm)
+                ui.button("Disarm them", on_click=self._disarm)
                 ui.button("Keep them", on_click=self._disarm_dialog.close).props("flat")
 
-    def _build_tabs(self, tests_folder: Path | None) -> None:
+    def _build_tabs(self, lab: Path | None) -> None:
         with ui.tabs().props("dense align=left inline-label").classes("wide") as tabs:
             units_tab, checks_tab = ui.tab("Units"), ui.tab("Checks")
             aim_tab, orders_tab, test_tab = ui.tab("Aim"), ui.tab("Orders"), ui.tab("Last test")
@@ -106,17 +111,14 @@ class ControlPage:
             with ui.tab_panel(units_tab).classes("pane"):
                 self._build_table()
             with ui.tab_panel(checks_tab).classes("pane"):
-                self._checks_words = ui.label().classes("strong")
-                self._checks = ui.html("", sanitize=False).classes("scroll")
-                self._show_checks()
+                self._checks = ChecksPane()
+                self._checks.show(self._views.values())
             with ui.tab_panel(aim_tab).classes("pane"):
                 self._aim = AimPane([u.name for u in self._units], self._desk)
             with ui.tab_panel(orders_tab).classes("pane"):
-                self._order_list = ui.html(
-                    '<p class="hint">No order was given yet.</p>', sanitize=False
-                ).classes("scroll")
+                self._orders = OrdersPane()
             with ui.tab_panel(test_tab).classes("pane"):
-                last_test_pane(tests_folder)
+                last_test_pane(lab)
 
     def _build_table(self) -> None:
         self._grid: ui.aggrid
@@ -125,8 +127,12 @@ class ControlPage:
                 placeholder="Filter: a name, a state, a word", on_change=lambda e: self._set_filter(e.value)
             )
             self._filter.props("dense outlined clearable").classes("grow")
-            ui.button("All shown", on_click=lambda: self._grid.run_grid_method("selectAll", "filtered"))
-            ui.button("None", on_click=lambda: self._grid.run_grid_method("deselectAll")).props("flat")
+            shown = ui.button(
+                "All shown", on_click=lambda: self._grid.run_grid_method("selectAll", "filtered")
+            )
+            shown.props('aria-label="All shown: choose these units"')
+            none = ui.button("None", on_click=lambda: self._grid.run_grid_method("deselectAll")).props("flat")
+            none.props('aria-label="None: choose no unit"')
         column = {"sortable": True, "filter": True, "resizable": True}
         self._grid = ui.aggrid(
             {
@@ -147,7 +153,7 @@ class ControlPage:
                 "rowData": [_row(view) for view in self._views.values()],
                 "rowSelection": {"mode": "multiRow", "enableClickSelection": False},
                 ":getRowId": "params => params.data.name",
-                "rowHeight": 38,
+                "rowHeight": 44,
             },
             auto_size_columns=False,
         ).classes("units-grid")  # fmt: skip
@@ -171,7 +177,7 @@ class ControlPage:
                 ui.run_javascript(f"bricktrack.setStates({json.dumps(told)})")
             self._grid.run_grid_method("applyTransaction", {"update": [_row(view) for view in changed]})
             self._show_counts()
-            self._show_checks()
+            self._checks.show(self._views.values())
         if self._order_version != self._desk.version:
             self._order_version = self._desk.version
             self._show_order()
@@ -184,28 +190,20 @@ class ControlPage:
                 n = states.count(state)
                 if not n:
                     continue
-                chip = ui.element("button").classes("chip").props(f'data-state="{state}" type="button"')
+                chip = (
+                    ui.element("button")
+                    .classes("chip")
+                    .props(
+                        f'data-state="{state}" type="button" '
+                        f'aria-label="{n} {state}: {look.meaning}. Show these in the table"'
+                    )
+                )
                 chip.on("click", lambda s=state: self._filter.set_value(s))
                 with chip:
                     ui.label(f"{look.letter}  {n} {state}")
                     ui.tooltip(f"{look.meaning}; click to filter")
             if any(view.simulated for view in self._views.values()):
-                ui.label("simulated units").classes("chip").style("background:#fff;color:#1b1b1b")
-
-    def _show_checks(self) -> None:
-        failing = [v for v in self._views.values() if v.problems or v.state == "asking"]
-        warned = [v for v in self._views.values() if v.warnings and not v.problems]
-        n_good = len(self._views) - len(failing)
-        self._checks_words.text = f"{n_good} of {len(self._views)} units pass" + (
-            f", {len(warned)} of them with a warning" if warned else ""
-        )
-        lines = [
-            (view.name, level, words, remedy)
-            for level, views in (("fails", failing), ("warning", warned))
-            for view in views
-            for words, remedy in (view.problems if level == "fails" else view.warnings)
-        ]
-        self._checks.content = _table(("unit", "", "because", "what to do"), lines)
+                ui.label("simulated units").classes("told")
 
     def _show_order(self) -> None:
         order = self._desk.current
@@ -218,10 +216,7 @@ class ControlPage:
         for button in (self._arm_button, self._disarm_button):
             button.set_enabled(not is_under_way)
         self._pull_button.set_enabled(not is_under_way and self._desk.runs_folder is not None)
-        lines = [(unit, "FAILED", words) for unit, words in list(order.refused.items())]
-        lines += [("", "note", words) for words in list(order.notes)[-_MOST_LISTED:]]
-        lines += [(unit, "done", words) for unit, words in list(order.acknowledged.items())]
-        self._order_list.content = f"<p>{escape(order.words)}</p>" + _table(("unit", "", "says"), lines)
+        self._orders.show(order)
 
     def _set_filter(self, text: str | None) -> None:
         self._grid.run_grid_method("setGridOption", "quickFilterText", text or "")
@@ -253,9 +248,16 @@ class ControlPage:
         return [name for name in self._views if name in chosen or not chosen]
 
     def _open_arm(self) -> None:
-        n = len(self._meant())
-        self._arm_title.text = f"Arm {n} unit{'' if n == 1 else 's'} for the next first edge"
+        meant = self._meant()
+        self._arm_title.text = f"Arm {self._count(meant)} for the next first edge?"
+        refusing = [name for name in meant if self._views[name].state != "idle"]
+        self._arm_doubt.text = f"Not idle, so not to be armed: {_some(refusing)}" if refusing else ""
         self._arm_dialog.open()
+
+    def _count(self, names: list[str]) -> str:
+        if len(names) == 1:
+            return names[0]
+        return f"{'all ' if len(names) == len(self._views) else ''}{len(names)} units"
 
     async def _arm(self) -> None:
         if not self._label.validate():
@@ -267,11 +269,15 @@ class ControlPage:
         )
 
     async def _disarm_meant(self) -> None:
-        """Disarm the units chosen; all of them only after asking, as it ends a test that waits."""
-        if self._chosen:
+        """Disarm the units chosen; all of them, or one that records, only after asking: it ends a test."""
+        meant = self._meant()
+        recording = [name for name in meant if self._views[name].state in ("recording", "saving")]
+        if self._chosen and not recording:
             await self._disarm()
-        else:
-            self._disarm_dialog.open()
+            return
+        self._disarm_title.text = f"Disarm {self._count(meant)}?"
+        self._disarm_doubt.text = f"Their runs end now: {_some(recording)}" if recording else ""
+        self._disarm_dialog.open()
 
     async def _disarm(self) -> None:
         self._disarm_dialog.close()
@@ -293,7 +299,15 @@ class ControlPage:
         ui.notify(words, type="positive" if good else "negative", multi_line=True, timeout=8_000)
 
 
+_BANNER = (
+    '<div id="lost" role="alert" hidden><span></span>'
+    '<button type="button" onclick="location.reload()">Reload the page</button></div>'
+)
 _TILE_HANDLER = '(e) => { const t = e.target.closest(".unit"); if (t) emit(t.dataset.unit); }'
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _is_label(text: str | None) -> bool:
@@ -311,15 +325,3 @@ def _row(view: UnitView) -> dict[str, object]:
         "run_id": view.run_id,
         "note": view.note,
     }
-
-
-def _table(heads: tuple[str, ...], lines: Sequence[tuple[str, ...]]) -> str:
-    """Return lines as an HTML table, everything escaped: units and errors write what they like."""
-    if not lines:
-        return ""
-    head = "".join(f"<th>{escape(h)}</th>" for h in heads)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{escape(c)}</td>" for c in line) + "</tr>" for line in lines[:_MOST_LISTED]
-    )
-    more = f'<p class="hint">and {len(lines) - _MOST_LISTED} more</p>' if len(lines) > _MOST_LISTED else ""
-    return f'<table class="fails"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}'

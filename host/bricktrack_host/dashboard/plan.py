@@ -40,24 +40,26 @@ def _closest(points: list[tuple[float, float]]) -> float:
 
 
 def plan_svg(units: list[UnitConfig], views: dict[str, UnitView]) -> str:
-    """Return the plan as SVG; ``plan.js`` keeps each tile's state up to date."""
+    """Return the plan as SVG; ``page.js`` keeps each tile's state, and which of them the tab key goes to."""
     at, width, height = places(units)
     tiles = "".join(
-        _tile(unit.name, views[unit.name].state, x, y) for unit, (x, y) in zip(units, at, strict=True)
+        _tile(unit.name, views[unit.name].state, x, y, has_tab=i == 0)
+        for i, (unit, (x, y)) in enumerate(zip(units, at, strict=True))
     )
     return (
-        f'<svg id="plan" viewBox="0 0 {width:.0f} {height:.0f}" role="group" aria-label="Plan of the array">'
-        f"{tiles}</svg>"
+        f'<svg id="plan" viewBox="0 0 {width:.0f} {height:.0f}" role="group"'
+        f' aria-label="Plan of the array; arrow keys go from unit to unit, space chooses">{tiles}</svg>'
     )
 
 
-def _tile(name: str, state: str, x: float, y: float) -> str:
+def _tile(name: str, state: str, x: float, y: float, *, has_tab: bool) -> str:
     shown = name if len(name) <= 8 else "…" + name[-7:]
     half = _TILE / 2
     words = f"{name}: {state}"
     return (
-        f'<g class="unit" data-unit="{escape(name)}" data-state="{state}" tabindex="0" role="button"'
-        f' aria-label="{escape(words)}" transform="translate({x:.1f} {y:.1f})">'
+        f'<g class="unit" data-unit="{escape(name)}" data-state="{state}" role="button"'
+        f' tabindex="{0 if has_tab else -1}" aria-pressed="false" aria-label="{escape(words)}"'
+        f' transform="translate({x:.1f} {y:.1f})">'
         f"<title>{escape(words)}</title>"
         f'<rect x="{-half}" y="{-half}" width="{_TILE}" height="{_TILE}" rx="6"/>'
         f'<text class="letter" y="1">{STATES[state].letter}</text>'

@@ -16,8 +16,7 @@ from nicegui import ui
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.dashboard.access import Door, check_access
 from bricktrack_host.dashboard.fleet_watch import FleetWatch
-from bricktrack_host.dashboard.last_test import find_last_test
-from bricktrack_host.dashboard.last_test_pane import REPORT_PATH
+from bricktrack_host.dashboard.last_test import REPORTS_PATH, served_report
 from bricktrack_host.dashboard.orders import OrderDesk
 from bricktrack_host.dashboard.page import ControlPage
 from bricktrack_host.transfer.contact import Dialer
@@ -73,7 +72,7 @@ def serve(
     dialer: Dialer,
     *,
     fleet: Fleet | None,
-    tests_folder: Path | None,
+    lab: Path | None,
     every_s: float,
     on_ready: Callable[[str], None],
 ) -> None:
@@ -81,6 +80,8 @@ def serve(
 
     Parameters
     ----------
+    lab : Path or None
+        Folder of the fleet file, with tests and runs; `None` without one.
     on_ready : callable
         Hears the page's address once it can be opened.
 
@@ -95,15 +96,15 @@ def serve(
         desk = OrderDesk(units, dialer, fleet.runs_path if fleet is not None else None)
         app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
-        @app.get(REPORT_PATH)
-        def report() -> Response:
-            last = find_last_test(tests_folder) if tests_folder is not None else None
-            if last is None or last.report is None:
-                return PlainTextResponse("There is no report yet.\n", status_code=404)
-            return FileResponse(last.report, media_type="text/html")
+        @app.get(REPORTS_PATH + "{path:path}")
+        def report(path: str) -> Response:
+            file = served_report(lab, path) if lab is not None else None
+            if file is None:
+                return PlainTextResponse("There is no such report here.\n", status_code=404)
+            return FileResponse(file, media_type="text/html")
 
         def root() -> None:
-            ControlPage(units, watch, desk, tests_folder)
+            ControlPage(units, watch, desk, lab)
 
         ui.run_with(app, root=root, title="bricktrack", tailwind=False, show_welcome_message=False)
         config = uvicorn.Config(
