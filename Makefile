@@ -15,7 +15,7 @@ $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-	    -e '.[device,sim,host,dashboard,scale]' --group dev
+	    -e '.[device,sim,host,dashboard,scale,analysis,view]' --group dev
 	@touch $@
 
 demo: $(READY)  ## record a simulated brick with the real daemon, pull it, process it, open the report

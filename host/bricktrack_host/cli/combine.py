@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
-from bricktrack_host.cli._console import err, out, print_json
+from bricktrack_host.cli._console import out, print_json
+from bricktrack_host.cli._progress import stage_of_counts
 from bricktrack_host.cli._units import FleetOption, JsonOption, fleet_path
 from bricktrack_host.transfer.fleet_config import load_fleet
 
@@ -55,13 +55,10 @@ def combine(
             )
         results[unit] = results_of(run)
     folder = output or path.resolve().parent / "tests" / name
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task("")
+    with stage_of_counts() as progress:
         summary = combine_test(
-            name, results, config.assembly, folder, also=write_combined_report,
-            progress=lambda what, done, of: bar.update(task, description=what, completed=done, total=of),
-        )  # fmt: skip
+            name, results, config.assembly, folder, also=write_combined_report, progress=progress
+        )
     if as_json:
         print_json(summary)
         return
