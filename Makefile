@@ -21,8 +21,8 @@ $(READY): pyproject.toml constraints.txt
 demo: $(READY)  ## record a simulated brick with the real daemon, pull it, process it, open the report
 	$(BIN)/bricktrack demo --folder demo
 
-test: $(READY)  ## all tests
-	$(BIN)/python -m pytest
+test: $(READY)  ## all tests, two at a time
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 test-virtual-camera: $(READY)  ## the picamera2 adapter under the real libraries, on the virtual Pi
 	tests/virtual_pi/run_camera.sh

@@ -2,8 +2,12 @@
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
+
+# Simulated cameras, samplers and units run in real time there: one after the other, or they disturb each other.
+_IN_REAL_TIME = ("contract", "end_to_end", "unit/device", "virtual_pi")
 
 # A shell's background job ignores Ctrl-C, and hands that on to the programs that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -19,3 +23,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="also run the tests marked 'hardware': on the hardware of this computer, given its bricktrackd.toml "
         "(service stopped), or on a running unit elsewhere, given tcp://HOST:PORT",
     )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give all tests in real time to one worker of pytest-xdist, and of the others a file as a whole to any."""
+    tests = Path(__file__).parent
+    real_time = [tests / folder for folder in _IN_REAL_TIME]
+    for item in items:
+        keeps_time = any(item.path.is_relative_to(folder) for folder in real_time)
+        item.add_marker(pytest.mark.xdist_group("real time" if keeps_time else str(item.path)))
