@@ -17,6 +17,7 @@ from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag
 from bricktrack_host.compiled import compiled
 from bricktrack_host.fusion.running_median import running_median
+from bricktrack_host.fusion.vibration import mend_vibration
 from bricktrack_host.fusion.signal_kernel import SignalPieces, integrate_steps
 from bricktrack_host.tracks import ImuTrack
 
@@ -27,6 +28,7 @@ _BRIDGE_PERIODS = 3.5  # up to here the cubic may bridge it; beyond, a straight 
 _PREDICTION_GAIN = comb(16, 8) ** 0.5 / comb(8, 4)
 _STEADY_SAMPLES = 25
 _IMPACT_SIGMA = 5.0
+_VIBRATION_MPS2 = 0.3  # of the median sample off its neighbours: a steady vibration, which can be predicted
 _CLIP_SHARE = 0.98  # of the range: filters inside the chip round a clipped peak off a little
 
 
@@ -226,7 +228,11 @@ class ImuSignal:
         period_s = float(np.median(np.diff(t_s)))
         clip_limit = imu.acc_range_mps2 if imu.acc_range_mps2 > 0 else np.inf
         acc, clip_sd = _bridge_clipped(t_s, imu.acc_mps2[use], clip_limit)
-        gyro = imu.gyro_radps[use]
+        gyro, filled_sd = imu.gyro_radps[use], np.zeros(len(t_s))
+        shaking = roughness(acc)[0]
+        if np.median(shaking) > _VIBRATION_MPS2:
+            mended = mend_vibration(gyro, acc, shaking)
+            gyro, acc, filled_sd = mended.gyro_radps, mended.acc_mps2, mended.acc_sd_mps2
         # Steady roughness before sharpening: what that adds to noise lies high, and is gone once integrated.
         (gyro_steady, gyro_impact), (acc_steady, acc_impact) = roughness(gyro), roughness(acc)
         if gyro_filter_s > 0:
@@ -235,6 +241,7 @@ class ImuSignal:
         if acc_filter_s > 0:
             acc = sharpened(t_s, acc, acc_filter_s)
             acc_impact = roughness(acc)[1]
+        acc_impact = np.maximum(acc_impact, filled_sd)
 
         interval = np.diff(t_s)
         missing = np.flatnonzero(interval > _GAP_PERIODS * period_s)
