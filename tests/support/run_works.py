@@ -52,3 +52,7 @@ def dies_once(note, progress):
 def stays(note, progress):
     note.write_text(str(os.getpid()))
     time.sleep(60)
+
+
+def dies(progress):
+    os.kill(os.getpid(), signal.SIGKILL)

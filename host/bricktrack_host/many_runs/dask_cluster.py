@@ -9,12 +9,17 @@ from typing import Any
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.many_runs.software_identity import differences, identity
-from bricktrack_host.many_runs.workers import Attempt, RunProgress, Work, WorkersGoneError, attempt
+from bricktrack_host.many_runs.workers import (
+    Attempt,
+    RunProgress,
+    Work,
+    WorkerLostError,
+    WorkersGoneError,
+    attempt,
+)
 
 _ANSWER_S = 10.0  # for the scheduler to answer
 _WITHOUT_WORKERS_S = 60.0  # a nanny starts a killed worker again within seconds
-_AHEAD = 2
-"""Works given out for each worker: the next one travels while one is done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +48,11 @@ class DaskCluster:
         If Dask is not installed, nobody answers at the address, or scheduler or a worker has other software.
     """
 
+    # Each is several: the scheduler itself gives a work to another worker, three times unless it is told
+    # otherwise. It blames a death on all that the worker had been given, so the second attempt is for the
+    # innocent.
+    attempts = 2
+
     def __init__(
         self, address: str, *, tls: TlsFiles | None = None, patience_s: float = _WITHOUT_WORKERS_S
     ) -> None:
@@ -63,7 +73,7 @@ class DaskCluster:
         self._executor = self._client.get_executor(pure=False)
 
     def room(self) -> int:
-        """Return how many works may be under way: some more than there are workers.
+        """Return how many workers there are: each has one work, so that a death tells which one is deadly.
 
         Raises
         ------
@@ -79,7 +89,7 @@ class DaskCluster:
                 f"{self._address} has had no worker for {self._patience_s:g} s. Start workers, then give the "
                 "same command again: it goes on"
             )
-        return _AHEAD * n_workers
+        return n_workers
 
     def submit(self, work: Work[Any], progress: RunProgress) -> "Future[Attempt[Any]]":
         """Give a work to the cluster, which gives it to another worker if the first one dies."""
@@ -127,7 +137,10 @@ class DaskCluster:
         self._progress.pop(token, None)
         if not outer.set_running_or_notify_cancel():
             return
-        outer.set_result(_came_of(done))
+        try:
+            outer.set_result(_came_of(done))
+        except WorkerLostError as e:
+            outer.set_exception(e)
 
 
 def _came_of(done: "Future[Attempt[Any]]") -> Attempt[Any]:
@@ -139,11 +152,10 @@ def _came_of(done: "Future[Attempt[Any]]") -> Attempt[Any]:
         return Attempt(None, "the scheduler is gone, or let go of this run. Give the same command again")
     except KilledWorker as e:
         n = e.allowed_failures + 1
-        return Attempt(
-            None,
-            f"{n} workers died while they processed it, the last of them {e.last_worker.address}. Memory may "
-            "have run out there: see the workers' logs",
-        )
+        raise WorkerLostError(
+            f"{n} worker{'s' if n > 1 else ''} died under it, last {e.last_worker.address}. Memory may have "
+            "run out there: see the workers' logs"
+        ) from None
     except Exception as e:  # noqa: BLE001 - whatever the cluster says of this run, the others go on
         return Attempt(None, f"the cluster did not do it: {type(e).__name__}: {e}")
 

@@ -35,6 +35,8 @@ class LocalProcesses:
         Modules that the processes need: loaded once and shared, where the system can (not on Windows).
     """
 
+    attempts = 3
+
     def __init__(self, n_at_once: int, *, preload: Sequence[str] = ()) -> None:
         self._n_at_once = n_at_once
         self._context = _context(preload)

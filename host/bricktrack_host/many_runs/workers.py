@@ -9,8 +9,6 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from bricktrack_common.errors import BricktrackError
 
-ATTEMPTS = 3
-"""How often a work is begun whose worker dies under it."""
 _LOOK_S = 1.0  # between looks whether there are workers at all
 
 T = TypeVar("T")
@@ -74,7 +72,15 @@ class Instead(Generic[T]):
 
 
 class Workers(Protocol):
-    """Who does works, several at once, over the standard ``concurrent.futures``."""
+    """Who does works, several at once, over the standard ``concurrent.futures``.
+
+    Attributes
+    ----------
+    attempts : int
+        How often a work is given out whose worker dies under it.
+    """
+
+    attempts: int
 
     def room(self) -> int:
         """Return how many works may be given out at once.
@@ -115,7 +121,7 @@ def do_all(
 ) -> Generator[Outcome[T], None, None]:
     """Have every work done, and yield what became of each as it ends.
 
-    A work whose worker dies is given out again, `ATTEMPTS` times in all. Closing the iterator, or an
+    A work whose worker dies is given out again, as often as its ``workers`` say. Closing the iterator, or an
     exception such as `KeyboardInterrupt` in its consumer, stops the workers.
 
     Parameters
@@ -152,10 +158,10 @@ def do_all(
                 try:
                     came = future.result()
                 except WorkerLostError as e:
-                    if n_attempt < ATTEMPTS:
+                    if n_attempt < workers.attempts:
                         waiting.append((index, n_attempt + 1, make))
                     else:
-                        yield Outcome(index, None, f"given up after {ATTEMPTS} attempts: {e}")
+                        yield Outcome(index, None, f"given up after {n_attempt} attempts: {e}")
                     continue
                 outcome = _finished(index, came, finish)
                 if isinstance(outcome, Instead):
