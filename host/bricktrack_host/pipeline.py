@@ -8,8 +8,6 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-
 from bricktrack_common.brick_model import BrickModel, load_brick_model
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import ConfigError, TrackingError
@@ -150,7 +148,7 @@ def process_run(
             calibration_sha256=sha256_file(calibration),
             layout_sha256=sha256_file(layout),
             software_version=software_version(),
-            settings=msgspec.to_builtins(settings),
+            settings=settings.facts(),
         ),
         timings_s=stages.seconds,
     )

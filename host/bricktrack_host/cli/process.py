@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import typer
@@ -26,7 +26,8 @@ from bricktrack_host.cli._processing import (
     stage_bar,
 )
 from bricktrack_host.cli._units import FleetOption, fleet_path
-from bricktrack_host.transfer.fleet_config import CameraMount, UnitConfig, load_fleet
+from bricktrack_host.transfer.camera_config import CameraMount
+from bricktrack_host.transfer.fleet_config import UnitConfig, load_fleet
 from bricktrack_host.transfer.pull import PulledRun
 
 # What computes is imported by the command that runs it: OpenCV, SciPy, PyArrow and matplotlib take seconds
@@ -45,6 +46,7 @@ __all__ = [
     "stage_bar",
 ]
 
+_MOVING = "A camera that moves"
 CalibrationOption = Annotated[
     Path | None,
     typer.Option("--calibration", "-c", help="Calibration file of this unit. \\[default: the fleet file's]"),
@@ -86,10 +88,36 @@ def process(
     camera: Annotated[
         CameraMount | None,
         typer.Option(
-            help="What the camera moves with; unless static, optical poses alone. "
-            "\\[default: the fleet file's, else static]"
+            help="What the camera moves with: nothing, a component with an IMU, or the table. "
+            "\\[default: the fleet file's, else static]",
+            rich_help_panel=_MOVING,
         ),
     ] = None,
+    camera_run: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run of the unit whose IMU moves with the camera. "
+            "\\[default: the one beside RUN with its label]",
+            rich_help_panel=_MOVING,
+        ),
+    ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV of the table's accelerations, where the camera moves with it.", rich_help_panel=_MOVING
+        ),
+    ] = None,
+    sample_column: Annotated[
+        str | None,
+        typer.Option(
+            help="Column of the CSV with the sample numbers. \\[default: rows are counted]",
+            rich_help_panel=_MOVING,
+        ),
+    ] = None,
+    first_sample: Annotated[
+        int,
+        typer.Option(help="What the CSV calls the sample of the first rising edge.", rich_help_panel=_MOVING),
+    ] = 0,
     again: Annotated[
         bool, typer.Option("--again", help="Also runs whose results are of the same input already.")
     ] = False,
@@ -115,6 +143,8 @@ def process(
         bricktrack process runs/b2_* --fleet fleet.toml --jobs 4
 
         bricktrack process runs/*_shake-12 --scheduler tcp://10.0.0.5:8786
+
+        bricktrack process runs/b7-2_9f31c2_0007_shake-12 --table shake-12.csv --sample-column Sample
     """
     from bricktrack_host.pipeline import ProcessSettings
 
@@ -122,6 +152,10 @@ def process(
         raise ConfigError(
             f"--output is for one run; {len(runs)} were given. Leave it out: each has its own folder"
         )
+    if camera_run is not None and len(runs) > 1:
+        raise ConfigError(f"--camera-run is for one run; {len(runs)} were given")
+    if table is None and (sample_column is not None or first_sample):
+        raise ConfigError("--sample-column and --first-sample say how to read a --table; none was given")
     where = Where(jobs, scheduler, send, (tls_ca, tls_cert, tls_key))
     settings = ProcessSettings(
         segmentation=segmentation,
@@ -130,9 +164,12 @@ def process(
         imu=imu,
         use_imu=use_imu,
     )
+    feels = {
+        "camera_run": camera_run, "table": table, "sample_column": sample_column, "first_sample": first_sample
+    }  # fmt: skip
     job_of = partial(
         _job, calibration=calibration, layout=layout, camera=camera, fleet_file=fleet, settings=settings,
-        output=output, truth=truth,
+        output=output, truth=truth, feels=feels,
     )  # fmt: skip
     if len(runs) == 1 and scheduler is None:
         process_here(job_of(runs[0]), again=again)
@@ -152,13 +189,15 @@ def process_pulled(unit: UnitConfig, pulled: PulledRun) -> None:
     """Process one run that was just pulled, with the calibration and layout that the fleet file names."""
     from bricktrack_host.many_runs.run_job import RunJob
     from bricktrack_host.pipeline import ProcessSettings
+    from bricktrack_host.stages.camera_sensor import choose_camera_sensor
 
     if unit.calibration_path is None or unit.layout_path is None:
         raise ConfigError(
             f"fleet.toml names no calibration or no layout for unit '{unit.name}'. Add them, or "
             f"process by hand: bricktrack process {pulled.folder} --calibration FILE --layout FILE"
         )
-    settings = ProcessSettings(camera=unit.camera)
+    sensor = choose_camera_sensor(pulled.folder, unit)
+    settings = ProcessSettings(camera=unit.camera, camera_sensor=sensor)
     job = RunJob(pulled.folder, unit.calibration_path, unit.layout_path, settings)
     process_here(job, again=False)
 
@@ -173,11 +212,20 @@ def _job(
     settings: "ProcessSettings | None" = None,
     output: Path | None = None,
     truth: Path | None = None,
+    feels: dict[str, Any] | None = None,
 ) -> "RunJob":
-    """Return a run with what the options name, or else the fleet file for the run's unit."""
+    """Return a run with what the options name, or else the fleet file for the run's unit.
+
+    ``feels``: where to find what feels the camera's motion, see `choose_camera_sensor`.
+    """
     from bricktrack_host.many_runs.run_job import RunJob
     from bricktrack_host.pipeline import ProcessSettings
+    from bricktrack_host.stages.camera_sensor import choose_camera_sensor
 
+    feels = feels or {}
+    sensor = None
+    if fleet_file is None and (feels.get("camera_run") or feels.get("table")):
+        fleet_file = fleet_path(None)  # which says how that sensor sits
     if fleet_file is not None or calibration is None or layout is None:
         unit = _unit_of(run, fleet_file)
         calibration, layout = calibration or unit.calibration_path, layout or unit.layout_path
@@ -187,7 +235,11 @@ def _job(
                 f"{'calibration' if calibration is None else 'layout'}"
             )
         camera = camera or unit.camera
-    settings = msgspec.structs.replace(settings or ProcessSettings(), camera=camera or "static")
+        if camera == unit.camera:
+            sensor = choose_camera_sensor(run, unit, **feels)
+    settings = msgspec.structs.replace(
+        settings or ProcessSettings(), camera=camera or "static", camera_sensor=sensor
+    )
     return RunJob(run, calibration, layout, settings, output=output, truth=truth)
 
 

@@ -4,6 +4,7 @@ from typing import Literal
 
 import msgspec
 
+from bricktrack_host.results.result_store import Details
 from bricktrack_host.stages.camera_sensor import CameraSensor
 from bricktrack_host.transfer.camera_config import CameraMount
 
@@ -40,3 +41,13 @@ class ProcessSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     camera: CameraMount = "static"
     camera_sensor: CameraSensor | None = None
     max_clock_offset_s: float = 0.25
+
+    def facts(self) -> Details:
+        """Return the settings by name, as results store them: those of the camera's sensor one by one."""
+        facts = msgspec.to_builtins(self)
+        sensor = facts.pop("camera_sensor") or {}
+        for name, value in sensor.items():
+            if value not in ("", None):
+                rows = [x for row in value for x in row] if name == "rotation" else value
+                facts[f"camera_sensor_{name}"] = rows
+        return dict(facts)

@@ -18,10 +18,10 @@ from bricktrack_common.wire_messages import HelloReply
 from bricktrack_host.transfer.assembly_config import AssemblyConfig, check_assembly
 from bricktrack_host.transfer.camera_config import (
     CameraImuEntry,
+    CameraMount,
     CameraTableEntry,
     check_camera,
 )
-from bricktrack_host.transfer.camera_config import CameraMount as CameraMount
 
 
 class UnitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
