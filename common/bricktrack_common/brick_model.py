@@ -37,6 +37,11 @@ class ImuEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     rotation: tuple[_Vector, _Vector, _Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
+DEFAULT_SHIFT_SD_PER_RADIUS = 0.0015
+"""Of a fitted LED profile: between LEDs that saturate, just do not, and are dim, the middle of the light
+moves along the axis by 0.001 to 0.0025 of radius times sine (simulated, limb 30 % darker)."""
+
+
 class ProfileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The ``[led_profile]`` of a layout file: the shape that an LED of this type shows.
 
@@ -46,10 +51,14 @@ class ProfileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         Length of the lit cylinder behind the dome's sphere centre.
     source : str
         How the figure was had: a fit names its recording. Never assumed.
+    shift_sd_per_radius : float
+        How far off the shape may be, as a standard deviation: a shift of the light's middle along the LED's
+        axis, over the LED's radius and the sine of the angle that it is seen at.
     """
 
     collar_mm: Annotated[float, msgspec.Meta(ge=0)]
     source: Annotated[str, msgspec.Meta(min_length=1)]
+    shift_sd_per_radius: Annotated[float, msgspec.Meta(ge=0, le=0.2)] = DEFAULT_SHIFT_SD_PER_RADIUS
 
 
 class LayoutFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

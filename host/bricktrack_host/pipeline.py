@@ -32,6 +32,7 @@ from bricktrack_host.stages.motion import fuse_run, output_grid, retime
 from bricktrack_host.stages.pictures import FIND, RunPictures, observe_run, require_video
 from bricktrack_host.stages.progress import ProcessProgress, Silent, Stages
 from bricktrack_host.stages.settings import ProcessSettings
+from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 from bricktrack_host.tracks import OpticalTrack
@@ -114,6 +115,9 @@ def process_run(
     problems += pictures.problems()
     with stages("solve poses"):
         first = start_poses(observations, rays.ray_model, brick, form=settings.prsoi_form)
+        observations = with_measured_noise(
+            observations, first, rays.ray_model, brick, rolling_shutter=settings.rolling_shutter
+        )
         optical = solve_poses(
             observations, rays.ray_model, brick, rolling_shutter=settings.rolling_shutter, first=first
         )

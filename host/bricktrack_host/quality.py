@@ -44,7 +44,8 @@ class PoseFlag(IntFlag):
     DROPOUT = 128
     """Fused: no optical pose within one and a half frame periods."""
     IMPACT = 256
-    """Fused: the acceleration changed faster than the sensor's rate can follow."""
+    """The velocity changed faster than the sensors can follow: fused, by the accelerometer; optical, by a
+    moving frame whose LEDs obey no one motion. The covariance says so."""
     CLIPPED = 512
     """Fused: an inertial sample was at its range limit."""
     IMU_GAP = 1024

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import FloatArray, as_float_array
-from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.brick_model import DEFAULT_SHIFT_SD_PER_RADIUS, BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import skew
 from bricktrack_host.compiled import compiled
@@ -28,10 +28,6 @@ from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view
 UNKNOWN_SHIFT_PER_RADIUS = 0.1
 """Standard deviation of the unknown shift, in LED radii times the sine of the view angle: between a bare
 hemisphere (+0.19 r at 57 degrees) and a collar of two thirds of r (-0.09 r)."""
-
-FITTED_SHIFT_PER_RADIUS = 0.005
-"""The same for a fitted profile, which is one of shape, not of brightness: limb darkening and the lens's blur
-leave thresholded centroids up to 0.3 px off the outline's at a radius of 60 px (path-traced sample)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +102,7 @@ def predict_leds(
     ray_model: RayModel,
     *,
     collar_mm: float | None,
+    shift_sd_per_radius: float = UNKNOWN_SHIFT_PER_RADIUS,
 ) -> LedPrediction:
     """Predict what a camera sees of LEDs.
 
@@ -119,6 +116,8 @@ def predict_leds(
     ray_model : RayModel
     collar_mm : float or None
         `None`: not fitted; see the module.
+    shift_sd_per_radius : float
+        What the profile leaves unknown, see `shift_per_radius`.
     """
     centres = as_float_array("centres_camera_mm", centres_camera_mm, (..., 3))
     axes = as_float_array("axes_camera", axes_camera, (..., 3))
@@ -145,13 +144,16 @@ def predict_leds(
         J_px_per_axis=J_axis.reshape(*lead, 2, 3),
         area_px2=out[..., 2],
         facing=out[..., 3],
-        model_shift_px=shift_per_radius(collar_mm) * radii[..., None] * out[..., 4:],
+        model_shift_px=shift_sd_per_radius * radii[..., None] * out[..., 4:],
     )
 
 
-def shift_per_radius(collar_mm: float | None) -> float:
+def shift_per_radius(collar_mm: float | None, brick_model: BrickModel) -> float:
     """Return one standard deviation of what the profile leaves unknown, over radius times sine."""
-    return UNKNOWN_SHIFT_PER_RADIUS if collar_mm is None else FITTED_SHIFT_PER_RADIUS
+    if collar_mm is None:
+        return UNKNOWN_SHIFT_PER_RADIUS
+    profile = brick_model.led_profile
+    return DEFAULT_SHIFT_SD_PER_RADIUS if profile is None else profile.shift_sd_per_radius
 
 
 @compiled
@@ -207,7 +209,14 @@ def predict_brick(
     P, N = brick_model.led_positions_mm, brick_model.led_axes
     centres = np.einsum("nlij,lj->nli", np.broadcast_to(R, (R.shape[0], len(P), 3, 3)), P) + t
     axes = np.einsum("nlij,lj->nli", np.broadcast_to(R, (R.shape[0], len(P), 3, 3)), N)
-    prediction = predict_leds(centres, axes, brick_model.led_radii_mm, ray_model, collar_mm=collar_mm)
+    prediction = predict_leds(
+        centres,
+        axes,
+        brick_model.led_radii_mm,
+        ray_model,
+        collar_mm=collar_mm,
+        shift_sd_per_radius=shift_per_radius(collar_mm, brick_model),
+    )
     J = np.empty((*centres.shape[:2], 2, 6))
     J[..., :3] = -(prediction.J_px_per_mm @ (R @ skew(P)) + prediction.J_px_per_axis @ (R @ skew(N)))
     J[..., 3:] = prediction.J_px_per_mm

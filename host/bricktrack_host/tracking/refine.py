@@ -22,7 +22,7 @@ HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
 OUTLIER_SIGMAS = 5.0
 MIN_LEDS = 4
-_OWN_SHARE = 0.5
+OWN_SHARE = 0.5
 """Of what the profile leaves unknown, each LED's own part beside the common one: bodies between a bare
 hemisphere and one with a collar of 2 r / 3, seen at 5 to 57 degrees, differ so much from one factor."""
 _CHUNK_FRAMES = 1024  # their rays fit into a core's second-level cache
@@ -85,6 +85,10 @@ class RefinedPoses:
     n_used: FloatArray
     area_px2: FloatArray
     facing: FloatArray
+
+    def take(self, rows: IntArray) -> "RefinedPoses":
+        """Return the poses of some frames."""
+        return RefinedPoses(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def replaced(self, rows: IntArray, by: "RefinedPoses") -> "RefinedPoses":
         """Return these poses with those of some frames replaced."""
@@ -172,9 +176,9 @@ def _model(
         N=np.ascontiguousarray(brick_model.led_axes),
         radii=np.ascontiguousarray(brick_model.led_radii_mm),
         collar=np.nan if collar_mm is None else float(collar_mm),
-        shift_per_radius=shift_per_radius(collar_mm),
+        shift_per_radius=shift_per_radius(collar_mm, brick_model),
         profile_sd=0.0 if profile_is_exact else 1.0,
-        own_sd=_OWN_SHARE,
+        own_sd=OWN_SHARE,
         plane_a=float(a),
         apart=float(b - a),
         huber=HUBER_SIGMAS,

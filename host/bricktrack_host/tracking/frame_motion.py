@@ -1,0 +1,161 @@
+"""How the brick moves within a frame: when each LED was seen, and where it then was beside the frame's pose.
+
+By splines through the poses of neighbouring frames, or by a fused motion; both say how well they know it.
+"""
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.refine import LedMotion, RefinedPoses
+from bricktrack_host.tracks import FusedTrack, LedObservations
+
+_MAX_GAP_PERIODS = 3.5  # wider gaps end a spline: a shaken brick turns back within them
+_SPLINE_SHARE = 0.1
+_TWIST_FLOOR = np.array([0.005, 0.3])  # rad/s, mm/s: far below what moves a centroid within a frame
+_FUSED_TWIST_SD = np.repeat([0.03, 5.0], 3)  # rad/s, mm/s: of the fused motion between frames
+_JUMP_SHARE = 0.29  # sd of a moment anywhere within an interval, over its length: 1 / sqrt(12)
+_MIN_APART_S = 1e-3  # of an LED's instant and its frame's, for a velocity between them
+_UNKNOWN_TWIST = np.array([1.0, 1.0, 1.0, 300.0, 300.0, 300.0])
+"""Of a shaken brick (DESIGN 2: 0.3 m/s), where the neighbours do not say."""
+
+
+def led_times_ns(observations: LedObservations, ray_model: RayModel) -> tuple[IntArray, IntArray]:
+    """Return the instants of the frames, shape (n,), and of the LEDs in them, shape (n, n_leds).
+
+    Mid-exposure of a row is ``SensorTimestamp - exposure / 2 + row delay``, because the stamp is the start of
+    the first row's read-out, when its exposure ends. LEDs that were not seen carry the frame's instant.
+    """
+    mode = ray_model.sensor_mode
+    first = observations.sensor_timestamp_ns - observations.exposure_ns // 2
+    centre = first + int(np.rint(float(mode.row_delay_ns(0.5 * (mode.height - 1)))))
+    v = np.where(np.isfinite(observations.uv_px[..., 1]), observations.uv_px[..., 1], 0.5 * (mode.height - 1))
+    return centre, first[:, None] + np.rint(mode.row_delay_ns(v)).astype(np.int64)
+
+
+def led_motion(at_frames: FusedTrack, at_leds: FusedTrack) -> LedMotion:
+    """Return how the brick moves from the frames' instants to those of the LEDs, by a fused track.
+
+    Parameters
+    ----------
+    at_frames : FusedTrack
+        At the n instants of the frames.
+    at_leds : FusedTrack
+        At the n x n_leds instants of the LEDs, frame by frame.
+    """
+    n = len(at_frames.t_ns)
+    R = at_leds.R_camera_brick.reshape(n, -1, 3, 3)
+    t_mm = at_leds.t_camera_brick_mm.reshape(n, -1, 3)
+    turn = rvec_from_matrix(np.swapaxes(at_frames.R_camera_brick, -1, -2)[:, None] @ R)
+    return LedMotion(
+        rvec_brick_rad=turn,
+        shift_camera_mm=t_mm - at_frames.t_camera_brick_mm[:, None],
+        dt_s=np.asarray((at_leds.t_ns.reshape(n, -1) - at_frames.t_ns[:, None]) * 1e-9, dtype=np.float64),
+        twist_sd=np.tile(_FUSED_TWIST_SD, (n, 1)),
+    )
+
+
+def motion_to_leds(
+    t_ns: IntArray, led_t_ns: IntArray, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray
+) -> LedMotion:
+    """Return how far the brick moves from each frame's instant to each LED's, by splines over frames."""
+    n, n_leds = led_t_ns.shape
+    rvec, shift = np.zeros((n, n_leds, 3)), np.zeros((n, n_leds, 3))
+    twist_sd = np.tile(_UNKNOWN_TWIST, (n, 1))
+    valid = np.flatnonzero(all_finite(R_camera_brick, 2))
+    if valid.size >= 2:
+        seconds = (t_ns - t_ns[valid[0]]) * 1e-9
+        led_seconds = (led_t_ns - t_ns[valid[0]]) * 1e-9
+        period = float(np.median(np.diff(seconds[valid])))
+        for part in np.split(valid, np.flatnonzero(np.diff(seconds[valid]) > _MAX_GAP_PERIODS * period) + 1):
+            if part.size < 2:
+                continue
+            R0 = R_camera_brick[part[part.size // 2]]
+            turns = rvec_from_matrix(R0.T @ R_camera_brick[part])
+            samples = np.hstack([turns, t_camera_brick_mm[part]])
+            spline = CubicSpline(seconds[part], samples)
+            here, there = spline(seconds[part]), spline(led_seconds[part])
+            back = np.swapaxes(matrix_from_rvec(here[:, :3]), -1, -2)[:, None]
+            rvec[part] = rvec_from_matrix(back @ matrix_from_rvec(there[..., :3]))
+            shift[part] = there[..., 3:] - here[:, None, 3:]
+            twist_sd[part] = _twist_sd(samples, period)
+    return LedMotion(
+        rvec_brick_rad=rvec,
+        shift_camera_mm=shift,
+        dt_s=np.asarray((led_t_ns - t_ns[:, None]) * 1e-9, dtype=np.float64),
+        twist_sd=twist_sd,
+    )
+
+
+def motion_doubt_px2(
+    motion: LedMotion,
+    poses: RefinedPoses,
+    frames: IntArray,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    collar_mm: float | None,
+) -> FloatArray:
+    """Return how far an impact within a frame may put each LED from where the motion has it.
+
+    Parameters
+    ----------
+    motion : LedMotion
+    poses : RefinedPoses
+    frames : ndarray of int64, shape (m,)
+        Those wanted; they have poses.
+
+    Returns
+    -------
+    covariance_px2 : ndarray, shape (m, n_leds, 2, 2), px^2
+        Zero for an LED seen at the frame's own instant.
+
+    Notes
+    -----
+    A velocity that jumps by dv at an unknown moment within the IMU's 10 ms, or a frame's read-out, leaves the
+    path between known ends off by `_JUMP_SHARE` dv dt. The jump is the range of the motion's velocities
+    within the frame, and no less than what the twist is doubted by.
+    """
+    dt = motion.dt_s[frames]
+    long_enough = np.abs(dt) > _MIN_APART_S
+    with np.errstate(invalid="ignore", divide="ignore"):
+        pace = np.concatenate([motion.rvec_brick_rad[frames], motion.shift_camera_mm[frames]], axis=2)
+        pace = np.where(long_enough[..., None], pace / dt[..., None], np.nan)
+    jump = np.zeros((len(frames), 6))
+    some = long_enough.sum(axis=1) >= 2
+    jump[some] = np.nanmax(pace[some], axis=1) - np.nanmin(pace[some], axis=1)
+    sd = np.repeat(np.linalg.norm(jump.reshape(-1, 2, 3), axis=2), 3, axis=1) * _JUMP_SHARE
+    if motion.twist_sd is not None:
+        sd = np.maximum(sd, motion.twist_sd[frames])
+    _, J = predict_brick(
+        poses.R_camera_brick[frames],
+        poses.t_camera_brick_mm[frames],
+        ray_model,
+        brick_model,
+        collar_mm=collar_mm,
+    )
+    by_twist = J * (dt[..., None] * sd[:, None])[:, :, None, :]
+    return np.asarray(by_twist @ np.swapaxes(by_twist, -1, -2))
+
+
+def _twist_sd(samples: FloatArray, period_s: float) -> FloatArray:
+    """Return how wrong a cubic spline's velocity may be at each frame, shape (n, 6), rad/s and mm/s.
+
+    For a sine of w T = 1.8 (8.6 Hz at 30 frames a second) it is 8.5 % off, which is 0.026 of the fourth
+    difference over T; at lower frequencies less, at an impact several times that. Ends know one side only.
+    """
+    n = len(samples)
+    if n < 5:
+        return np.tile(_UNKNOWN_TWIST, (n, 1))
+    fourth = np.diff(samples, 4, axis=0)
+    size = np.stack([np.linalg.norm(fourth[:, :3], axis=1), np.linalg.norm(fourth[:, 3:], axis=1)], axis=1)
+    near = np.pad(size, ((4, 4), (0, 0)), mode="edge")  # frame i is centred among those from i to i + 4
+    local = np.max([near[k : k + n] for k in range(5)], axis=0)
+    sd = np.maximum(_SPLINE_SHARE * local / period_s, _TWIST_FLOOR)
+    sd[[0, 1, -2, -1]] *= 3.0
+    return np.asarray(np.repeat(np.minimum(sd, _UNKNOWN_TWIST[[0, 3]]), 3, axis=1))

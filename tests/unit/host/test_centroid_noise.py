@@ -1,0 +1,95 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from led_scenes import random_poses, seven_leds
+from pinhole import PinholeCamera
+
+from bricktrack_common.brick_model import ProfileEntry
+from bricktrack_host.tracking.centroid_noise import measure_noise, with_measured_noise
+from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
+from bricktrack_host.tracking.optical_track import solve_poses, start_poses
+from bricktrack_host.tracks import LedObservations
+
+CAMERA = PinholeCamera()
+PROFILE = ProfileEntry(collar_mm=0.7, source="test", shift_sd_per_radius=0.0)
+BRICK = replace(seven_leds(), led_profile=PROFILE)
+FRAME_NS = 33_333_333
+
+
+def seen(R, t, error_px):
+    prediction, _ = predict_brick(R, t, CAMERA, BRICK, collar_mm=0.7)
+    n = len(R)
+    return LedObservations(
+        sensor_timestamp_ns=np.arange(n, dtype=np.int64) * FRAME_NS,
+        exposure_ns=np.full(n, 2_000_000, dtype=np.int64),
+        uv_px=prediction.uv_px + error_px,
+        cov_px2=np.tile(FLOOR_SD_PX**2 * np.eye(2), (n, 7, 1, 1)),
+        area_px2=np.full((n, 7), 3500.0),
+        led_flags=np.zeros((n, 7), dtype=np.int64),
+        frame_flags=np.zeros(n, dtype=np.int64),
+    )
+
+
+def measured(observations):
+    first = start_poses(observations, CAMERA, BRICK)
+    return measure_noise(observations, first, CAMERA, BRICK, rolling_shutter=False)
+
+
+@pytest.mark.parametrize("sd_px", [0.01, 0.03, 0.12])
+def test_the_noise_of_many_places_is_found(sd_px):
+    n = 100
+    R, t = random_poses(n, seed=1)
+    noise = measured(seen(R, t, np.random.default_rng(2).normal(0, sd_px, (n, 7, 2))))
+    # 800 residuals: the sd to 2.5 %; the grid's step is 5 %.
+    assert noise.seen_sd_px == pytest.approx(sd_px, rel=0.08)
+    assert noise.sd_px == pytest.approx(np.sqrt((800 * sd_px**2 + FLOOR_SD_PX**2) / 799), rel=0.08)
+    assert noise.n_frames == n
+    assert noise.dof > 400
+
+
+def test_wrong_leds_do_not_count():
+    n = 60
+    R, t = random_poses(n, seed=3)
+    error = np.random.default_rng(4).normal(0, 0.02, (n, 7, 2))
+    error[::10, 3] += 1.5
+    assert measured(seen(R, t, error)).seen_sd_px == pytest.approx(0.02, rel=0.15)
+
+
+def test_a_hundred_pictures_of_one_place_say_little_more_than_one():
+    R, t = (np.repeat(x, 100, axis=0) for x in random_poses(1, seed=5))
+    rng = np.random.default_rng(6)
+    error = rng.normal(0, 0.02, (1, 7, 2)) + rng.normal(0, 0.003, (100, 7, 2))
+    noise = measured(seen(R, t, error))
+    assert 8 <= noise.dof < 12
+    # Eight residuals know their sd to a fourth, and the floor counts for one more.
+    assert noise.seen_sd_px == pytest.approx(0.02, rel=0.6)
+    assert noise.sd_px > 1.1 * noise.seen_sd_px
+
+
+def test_without_a_pose_the_floor_stays():
+    observations = seen(*random_poses(4, seed=7), 0.0)
+    observations.uv_px[:] = np.nan
+    noise = measured(observations)
+    assert (noise.sd_px, noise.n_frames) == (FLOOR_SD_PX, 0)
+    first = start_poses(observations, CAMERA, BRICK)
+    kept = with_measured_noise(observations, first, CAMERA, BRICK)
+    np.testing.assert_array_equal(kept.cov_px2, observations.cov_px2)
+
+
+def test_poses_with_the_measured_noise_are_as_good_as_they_say():
+    n = 150
+    R, t = random_poses(n, seed=8)
+    observations = seen(R, t, np.random.default_rng(9).normal(0, 0.02, (n, 7, 2)))
+    first = start_poses(observations, CAMERA, BRICK)
+    told = with_measured_noise(observations, first, CAMERA, BRICK, rolling_shutter=False)
+    shift_of = []
+    for each in (observations, told):
+        track = solve_poses(each, CAMERA, BRICK, rolling_shutter=False)
+        shift = t - track.t_camera_brick_mm
+        nees = np.einsum("ni,nij,nj->n", shift, np.linalg.inv(track.covariance[:, 3:, 3:]), shift)
+        shift_of.append(nees.mean() / 3)
+    # Chi-square with 450 degrees of freedom scatters by 7 %; the floor alone is nine times too wide.
+    assert shift_of[0] < 0.2
+    assert shift_of[1] == pytest.approx(1.0, abs=0.25)
