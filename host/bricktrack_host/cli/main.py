@@ -10,6 +10,7 @@ from bricktrack_host.cli import (
     calibrate,
     calibrate_leds,
     combine,
+    compare,
     configure,
     dashboard,
     dataset,
@@ -89,6 +90,7 @@ app.command("align", rich_help_panel=_RUNS)(align.align)
 app.command("evaluate", rich_help_panel=_JUDGE)(evaluate.evaluate)
 app.command("combine", rich_help_panel=_RUNS)(combine.combine)
 app.add_typer(dataset.app, name="dataset", rich_help_panel=_RUNS)
+app.command("compare", rich_help_panel=_RUNS)(compare.compare)
 app.command("export", rich_help_panel=_RUNS)(export.export)
 app.command("overlay", rich_help_panel=_RUNS)(overlay.overlay)
 app.add_typer(test_day.app, name="test", rich_help_panel=_UNITS)

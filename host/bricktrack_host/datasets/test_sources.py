@@ -8,7 +8,7 @@ import pyarrow.compute
 from bricktrack_common.errors import ConfigError, RunFormatError
 from bricktrack_host.assemblies.combined_test import AssemblyEntry, UnitEntry, read_components, read_test
 from bricktrack_host.datasets.motion_rows import ComponentRows, UnitSource
-from bricktrack_host.results.result_store import read_result, results_of
+from bricktrack_host.results.result_store import read_provenance, read_result, results_of
 
 
 def sources_of_test(folder: Path, *, name: str | None = None) -> list[UnitSource]:
@@ -96,8 +96,7 @@ def _results_of(folder: Path, unit: UnitEntry) -> Path:
         raise RunFormatError(
             f"{folder}: {unit.unit}'s results are no longer at {results}. Put them there, or combine again"
         )
-    result = read_result(results)
-    if result.manifest.run_id != unit.run_id or result.provenance != unit.provenance:
+    if read_provenance(results) != unit.provenance:
         raise RunFormatError(
             f"{folder}: {unit.unit} was processed again since the test was combined. Combine the test again"
         )

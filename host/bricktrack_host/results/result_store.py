@@ -265,6 +265,17 @@ def _write_files(result: RunResult, folder: Path) -> None:
     (folder / TIMINGS_NAME).write_bytes(dump_json(result.timings_s))
 
 
+def read_provenance(folder: Path) -> Provenance:
+    """Return what results are of, without their tables.
+
+    Raises
+    ------
+    RunFormatError
+        If the folder holds no results, or of a newer version.
+    """
+    return _read_summary(folder).provenance
+
+
 def read_result(folder: Path) -> RunResult:
     """Return the results that `write_results` wrote.
 
@@ -273,22 +284,11 @@ def read_result(folder: Path) -> RunResult:
     RunFormatError
         If the folder holds no results, is of a newer version, or a table is missing or damaged.
     """
-    path = folder / SUMMARY_NAME
-    if not path.is_file():
-        raise RunFormatError(f"{folder}: no {SUMMARY_NAME}; this is no results folder. Process the run first")
-    head = load_json(path, dict[str, Any])
-    if head.get("schema") != RESULTS_SCHEMA or not isinstance(head.get("version"), int):
-        raise RunFormatError(f"{path}: not a {RESULTS_SCHEMA} summary")
-    if head["version"] > RESULTS_VERSION:
-        raise RunFormatError(
-            f"{path}: {RESULTS_SCHEMA} version {head['version']}; this bricktrack reads up to version "
-            f"{RESULTS_VERSION}. Upgrade bricktrack on this machine"
-        )
-    summary = load_json(path, _Summary)
+    summary = _read_summary(folder)
     tables = {name: _read_table(folder / f"{name}.parquet", rows) for name, rows in summary.tables.items()}
     for name in ("optical", "fused", "leds"):
         if name not in tables:
-            raise RunFormatError(f"{path}: tables: no '{name}'")
+            raise RunFormatError(f"{folder / SUMMARY_NAME}: tables: no '{name}'")
     optical, observations = optical_from_tables(tables["optical"], tables["leds"], len(summary.led_names))
     fused, edge_index = fused_from_table(tables["fused"])
     imu = None
@@ -317,6 +317,21 @@ def read_result(folder: Path) -> RunResult:
         provenance=summary.provenance,
         timings_s=load_json(timings, dict[str, float]) if timings.is_file() else {},
     )
+
+
+def _read_summary(folder: Path) -> _Summary:
+    path = folder / SUMMARY_NAME
+    if not path.is_file():
+        raise RunFormatError(f"{folder}: no {SUMMARY_NAME}; this is no results folder. Process the run first")
+    head = load_json(path, dict[str, Any])
+    if head.get("schema") != RESULTS_SCHEMA or not isinstance(head.get("version"), int):
+        raise RunFormatError(f"{path}: not a {RESULTS_SCHEMA} summary")
+    if head["version"] > RESULTS_VERSION:
+        raise RunFormatError(
+            f"{path}: {RESULTS_SCHEMA} version {head['version']}; this bricktrack reads up to version "
+            f"{RESULTS_VERSION}. Upgrade bricktrack on this machine"
+        )
+    return load_json(path, _Summary)
 
 
 def _read_table(path: Path, n_rows: int) -> Any:
