@@ -21,6 +21,7 @@ from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Armed, Reply
+from bricktrack_device.capture.recorder import Recorder
 from bricktrack_device.config import (
     CameraTable,
     DeviceConfig,
@@ -29,8 +30,7 @@ from bricktrack_device.config import (
     SamplerTable,
     StorageTable,
 )
-from bricktrack_device.recorder import Recorder
-from bricktrack_device.run_store import RunStore
+from bricktrack_device.storage.run_store import RunStore
 
 MB = 1e6
 FRAME_PERIOD_S = 0.033327

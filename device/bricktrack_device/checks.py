@@ -4,6 +4,7 @@ import socket
 from collections.abc import Callable
 
 from bricktrack_common.errors import HardwareError
+from bricktrack_device.capture.recording import software_versions
 from bricktrack_device.config import DeviceConfig, ImuTable
 from bricktrack_device.health import machine, storage
 from bricktrack_device.health.camera import check_camera
@@ -12,7 +13,6 @@ from bricktrack_device.health.inertial import check_adapter, check_imu
 from bricktrack_device.health.keys import check_keys
 from bricktrack_device.health.trigger_line import check_trigger
 from bricktrack_device.interfaces import Rig
-from bricktrack_device.recording import software_versions
 
 Check = Callable[[], list[CheckResult]]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bricktrack_common.errors import BricktrackError
-from bricktrack_device import keys_cli
+from bricktrack_device.network import keys_cli
 
 # Imports stay inside the commands: each sampler's process imports this module again, and must stay small.
 if TYPE_CHECKING:

@@ -8,18 +8,18 @@ from types import FrameType
 
 from bricktrack_common.discovery import Announcement
 from bricktrack_common.key_files import fingerprint
-from bricktrack_device.advertisement import Advertisement
+from bricktrack_device.capture.recorder import Recorder
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.connection_guard import raise_descriptor_limit
-from bricktrack_device.file_server import FileServer
 from bricktrack_device.health.watch import HealthWatch
 from bricktrack_device.interfaces import Rig
-from bricktrack_device.recorder import Recorder
-from bricktrack_device.recovery import rebuild_manifest
+from bricktrack_device.network.advertisement import Advertisement
+from bricktrack_device.network.connection_guard import raise_descriptor_limit
+from bricktrack_device.network.file_server import FileServer
+from bricktrack_device.network.unit_keys import UnitKeys
 from bricktrack_device.remote_settings import RemoteSettings
-from bricktrack_device.run_store import RunStore
+from bricktrack_device.storage.recovery import rebuild_manifest
+from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.systemd_notify import notify
-from bricktrack_device.unit_keys import UnitKeys
 from bricktrack_device.unit_service import UnitService
 from bricktrack_device.watchdog import Watchdog
 

@@ -14,7 +14,7 @@ from bricktrack_common.errors import BricktrackError, ConfigError
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_common.wire_messages import ConfigValue
 from bricktrack_device.config import DeviceConfig, with_values
-from bricktrack_device.disk import Disk, storage_error
+from bricktrack_device.storage.disk import Disk, storage_error
 
 logger = logging.getLogger(__name__)
 

@@ -14,11 +14,11 @@ from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import BricktrackError, HardwareError
 from bricktrack_common.run_manifest import CameraSection
 from bricktrack_common.wire_messages import MAX_STILL_BYTES, StillEncoding, StillImage
+from bricktrack_device.capture.ring import FrameRing
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.in_time import in_time
 from bricktrack_device.interfaces import Camera, Rig, Still
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.ring import FrameRing
 
 if TYPE_CHECKING:
     import av

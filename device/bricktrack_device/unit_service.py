@@ -30,20 +30,20 @@ from bricktrack_common.wire_messages import (
     StatusReply,
     TakeStill,
 )
+from bricktrack_device.capture.recorder import Recorder
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.file_server import Answer
 from bricktrack_device.health.machine import processor_temperature_degc
 from bricktrack_device.health.watch import HealthWatch
 from bricktrack_device.interfaces import Rig
-from bricktrack_device.recorder import Recorder
+from bricktrack_device.network.file_server import Answer
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.remote_settings import RemoteSettings
-from bricktrack_device.run_store import RunStore
 from bricktrack_device.still import encode_still, take_still
+from bricktrack_device.storage.run_store import RunStore
 
 
 class UnitService:
-    """See the module's first line; meets `bricktrack_device.file_server.RequestHandler`.
+    """See the module's first line; meets `bricktrack_device.network.file_server.RequestHandler`.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class UnitService:
         return self._settings.config
 
     def handle(self, request: Request, answer: Answer) -> None:
-        """Answer one request, now or later; see `bricktrack_device.file_server.RequestHandler`."""
+        """Answer one request, now or later; see `bricktrack_device.network.file_server.RequestHandler`."""
         match request:
             case Hello():
                 answer(

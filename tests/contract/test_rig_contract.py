@@ -14,12 +14,12 @@ import pytest
 
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_device.backends import open_rig
-from bricktrack_device.bno055 import CHIP_ID, read_chip_id, set_up
+from bricktrack_device.capture.ring import JOIN_TOLERANCE_NS, FrameRing, cut_video
+from bricktrack_device.capture.trigger import Trigger
 from bricktrack_device.config import DeviceConfig, ImuMode, ImuTable, TriggerTable, load_config
-from bricktrack_device.imu_reader import ImuReader
+from bricktrack_device.inertial.bno055 import CHIP_ID, read_chip_id, set_up
+from bricktrack_device.inertial.imu_reader import ImuReader
 from bricktrack_device.interfaces import EncodedPacket, FrameMetadata, I2cBus, Rig
-from bricktrack_device.ring import JOIN_TOLERANCE_NS, FrameRing, cut_video
-from bricktrack_device.trigger import Trigger
 
 STREAM_S = 2.0
 

@@ -19,9 +19,9 @@ from bricktrack_common.imu_records import ImuFlag, read_imu
 from bricktrack_common.run_folder import Run, read_run
 from bricktrack_common.wire_messages import Disarmed, Refusal
 from bricktrack_device.config import ImuTable, RecordingTable, TriggerTable
-from bricktrack_device.disk import Disk
 from bricktrack_device.sim import sim_pins
 from bricktrack_device.sim.settings import SimFaults
+from bricktrack_device.storage.disk import Disk
 
 pytestmark = pytest.mark.slow
 

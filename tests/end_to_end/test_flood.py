@@ -31,7 +31,7 @@ from bricktrack_common.wire_messages import (
     decode_reply,
     encode_message,
 )
-from bricktrack_device.connection_guard import MAX_CONNECTIONS
+from bricktrack_device.network.connection_guard import MAX_CONNECTIONS
 
 pytestmark = pytest.mark.slow
 

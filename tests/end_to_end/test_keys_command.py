@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from bricktrack_common.errors import UnitError, UnitTimeoutError
 from bricktrack_common.key_files import make_key_pair, read_public_key, read_secret_key
 from bricktrack_common.wire_messages import HelloReply, Request
-from bricktrack_device.file_server import Answer, FileServer
-from bricktrack_device.key_folder import create_unit_key
-from bricktrack_device.unit_keys import UnitKeys
+from bricktrack_device.network.file_server import Answer, FileServer
+from bricktrack_device.network.key_folder import create_unit_key
+from bricktrack_device.network.unit_keys import UnitKeys
 from bricktrack_host.cli.main import app
 from bricktrack_host.transfer.fleet_config import load_fleet
 from bricktrack_host.transfer.unit_client import UnitClient

@@ -19,9 +19,9 @@ from light_unit import light_config
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Armed, Reply
+from bricktrack_device.capture.recorder import Recorder
 from bricktrack_device.config import RecordingTable, TriggerTable
-from bricktrack_device.recorder import Recorder
-from bricktrack_device.run_store import RunStore
+from bricktrack_device.storage.run_store import RunStore
 
 RUNS = int(os.environ.get("BRICKTRACK_RUNS", "20"))
 WARM_UP = 5

@@ -19,9 +19,9 @@ from bricktrack_common.wire_messages import (
     RunList,
     StatusReply,
 )
-from bricktrack_device.file_server import FileServer
+from bricktrack_device.network.file_server import FileServer
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.run_store import RunStore
+from bricktrack_device.storage.run_store import RunStore
 from bricktrack_host.transfer.fleet_config import UnitConfig
 from bricktrack_host.transfer.pull import pull_unit
 from bricktrack_host.transfer.unit_client import UnitClient

@@ -11,6 +11,7 @@ from device_fakes import FakeCamera
 
 from bricktrack_common.run_folder import Run, read_run
 from bricktrack_common.wire_messages import Armed, Reply
+from bricktrack_device.capture.recorder import Recorder
 from bricktrack_device.config import (
     DeviceConfig,
     ImuTable,
@@ -20,12 +21,11 @@ from bricktrack_device.config import (
     TriggerTable,
     UnitTable,
 )
-from bricktrack_device.disk import Disk
 from bricktrack_device.interfaces import Camera
-from bricktrack_device.recorder import Recorder
-from bricktrack_device.run_store import RunStore
 from bricktrack_device.sim.settings import SimFaults, SimSettings
 from bricktrack_device.sim.sim_rig import SimRig
+from bricktrack_device.storage.disk import Disk
+from bricktrack_device.storage.run_store import RunStore
 
 HZ = 200.0
 

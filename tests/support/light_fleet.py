@@ -23,13 +23,13 @@ from bricktrack_common.run_manifest import (
     write_manifest,
 )
 from bricktrack_common.wire_messages import Armed, Disarmed
+from bricktrack_device.capture.recorder import RecorderStatus
 from bricktrack_device.config import DeviceConfig, ServerTable, StorageTable, UnitTable
-from bricktrack_device.file_server import FileServer
-from bricktrack_device.recorder import RecorderStatus
+from bricktrack_device.network.file_server import FileServer
+from bricktrack_device.network.unit_keys import UnitKeys
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.remote_settings import RemoteSettings
-from bricktrack_device.run_store import RunStore
-from bricktrack_device.unit_keys import UnitKeys
+from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.unit_service import UnitService
 
 

@@ -35,8 +35,8 @@ from bricktrack_device.config import (
     UnitTable,
 )
 from bricktrack_device.daemon import Daemon
+from bricktrack_device.network.unit_keys import CLIENTS_NAME, UNIT_KEY_NAME
 from bricktrack_device.sim.sim_pins import make_factory
-from bricktrack_device.unit_keys import CLIENTS_NAME, UNIT_KEY_NAME
 
 PICTURE_BYTES = 50_000  # 12 Mbit/s at 30 pictures a second
 DURATION_S = 0.5

@@ -49,7 +49,7 @@ from bricktrack_common.wire_messages import (
     decode_request,
     encode_message,
 )
-from bricktrack_device.file_server import Answer, FileServer
+from bricktrack_device.network.file_server import Answer, FileServer
 from bricktrack_host.transfer.unit_client import UnitClient
 
 SHA = "0123456789abcdef" * 4

@@ -103,7 +103,7 @@ def test_the_services_user_reaches_the_hardware_and_a_fixed_priority():
     assert checks["storage"]["name"] == "storage"
     code = (
         "from bricktrack_device.config import SamplerTable\n"
-        "from bricktrack_device.imu_sampler import ask_for_realtime\n"
+        "from bricktrack_device.inertial.imu_sampler import ask_for_realtime\n"
         "print(ask_for_realtime(SamplerTable(cpu=-1, lock_memory=True)))"
     )
     granted = subprocess.run(

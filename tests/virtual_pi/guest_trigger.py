@@ -7,10 +7,10 @@ import time
 import guest_knobs
 import pytest
 
+from bricktrack_device.capture.edge_report import judge_edges
+from bricktrack_device.capture.trigger import Trigger
 from bricktrack_device.config import TriggerTable
-from bricktrack_device.edge_report import judge_edges
 from bricktrack_device.hardware.lgpio_pins import open_pin_factory
-from bricktrack_device.trigger import Trigger
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ import numpy as np
 
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_manifest import CameraSection
+from bricktrack_device.capture.ring import FrameRing
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health.blobs import Blob, channel_levels, find_blobs
 from bricktrack_device.health.findings import CheckResult, failure, good, warning
 from bricktrack_device.interfaces import FrameMetadata, Rig, Still
-from bricktrack_device.ring import FrameRing
 
 CAMERA_CHECK_S = 2.0
 _GAIN_TOLERANCE = 0.03

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 
 from bricktrack_common.errors import HardwareError
-from bricktrack_device.bno055 import CHIP_ID, MODE_NAMES, REG_ST_RESULT, REG_SYS_STATUS, read_chip_id
 from bricktrack_device.config import ImuTable
 from bricktrack_device.health.findings import CheckResult, failure, good, warning
+from bricktrack_device.inertial.bno055 import CHIP_ID, MODE_NAMES, REG_ST_RESULT, REG_SYS_STATUS, read_chip_id
 from bricktrack_device.interfaces import Rig
 
 _PARTS = ("accelerometer", "magnetometer", "gyroscope", "processor")

@@ -3,7 +3,7 @@
 from bricktrack_common.key_files import fingerprint
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health.findings import CheckResult, good, warning
-from bricktrack_device.unit_keys import UnitKeys
+from bricktrack_device.network.unit_keys import UnitKeys
 
 
 def check_keys(config: DeviceConfig) -> list[CheckResult]:

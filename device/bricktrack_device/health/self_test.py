@@ -12,12 +12,12 @@ import msgspec
 
 from bricktrack_common.errors import BricktrackError, HardwareError
 from bricktrack_device.bounded import finishes
+from bricktrack_device.capture.ring import FrameRing
+from bricktrack_device.capture.trigger import Trigger
 from bricktrack_device.config import DeviceConfig, ImuTable
 from bricktrack_device.health.findings import CheckResult, good, tried
 from bricktrack_device.health.inertial import check_imu
 from bricktrack_device.interfaces import Rig
-from bricktrack_device.ring import FrameRing
-from bricktrack_device.trigger import Trigger
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import StorageError
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health.findings import CheckResult, failure, good, warning
-from bricktrack_device.run_store import RunStore
+from bricktrack_device.storage.run_store import RunStore
 
 SPEED_TEST_BYTES = 16 << 20
 MAX_SAVING_S = 60.0

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 from statistics import median
 
+from bricktrack_device.capture.trigger import Trigger
 from bricktrack_device.config import DeviceConfig, TriggerTable
 from bricktrack_device.health.findings import CheckResult, good, warning
 from bricktrack_device.interfaces import Rig
-from bricktrack_device.trigger import Trigger
 
 LISTEN_S = 1.0
 _RATE_TOLERANCE = 0.02

@@ -13,7 +13,7 @@ from rich.table import Table
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_device.config import DeviceConfig, ImuTable
-from bricktrack_device.imu_reader import ImuReader
+from bricktrack_device.inertial.imu_reader import ImuReader
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.timing.loops import (
     METHODS,

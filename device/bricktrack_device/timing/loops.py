@@ -18,9 +18,9 @@ from typing import Literal
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import BricktrackError
 from bricktrack_common.imu_records import FIRST_REGISTER, N_DATA_BYTES, ImuRecord
-from bricktrack_device.bno055 import set_up
 from bricktrack_device.config import ImuTable, SamplerTable
-from bricktrack_device.imu_sampler import ask_for_realtime, sample
+from bricktrack_device.inertial.bno055 import set_up
+from bricktrack_device.inertial.imu_sampler import ask_for_realtime, sample
 from bricktrack_device.interfaces import BusOpener, I2cBus
 
 Method = Literal["grid", "naive", "adaptive"]

@@ -16,10 +16,10 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import ConfigError, HardwareError
 from bricktrack_common.run_manifest import CameraSection
+from bricktrack_device.capture.ring import FrameRing, VideoCut, cut_video
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.imu_sampler import sleep_until_ns
+from bricktrack_device.inertial.imu_sampler import sleep_until_ns
 from bricktrack_device.interfaces import EncodedPacket, Leds, Rig
-from bricktrack_device.ring import FrameRing, VideoCut, cut_video
 from bricktrack_device.timing.decode import decode_luma
 from bricktrack_device.timing.result_file import Result, make_result
 from bricktrack_device.timing.row_switches import (

@@ -5,8 +5,8 @@ import time
 import pytest
 
 from bricktrack_common.discovery import SERVICE_TYPE, Announcement, parse_announcement
-from bricktrack_device import advertisement as module
-from bricktrack_device.advertisement import Advertisement
+from bricktrack_device.network import advertisement as module
+from bricktrack_device.network.advertisement import Advertisement
 
 zeroconf = pytest.importorskip("zeroconf")
 

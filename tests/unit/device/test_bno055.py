@@ -3,8 +3,8 @@ from device_fakes import FakeBus
 
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.imu_records import AxisMap
-from bricktrack_device import bno055
 from bricktrack_device.config import ImuMode
+from bricktrack_device.inertial import bno055
 
 
 @pytest.fixture(autouse=True)

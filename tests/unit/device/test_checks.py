@@ -7,10 +7,10 @@ from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 from bricktrack_common.run_manifest import CameraSection
 from bricktrack_device.checks import run_checks
 from bricktrack_device.config import DeviceConfig, ImuTable, ServerTable, StorageTable, TriggerTable
-from bricktrack_device.file_server import FileServer
 from bricktrack_device.health import camera, storage, trigger_line
 from bricktrack_device.health.findings import CheckResult
 from bricktrack_device.interfaces import FrameMetadata, FrameSink, Still
+from bricktrack_device.network.file_server import FileServer
 
 
 @pytest.fixture(autouse=True)

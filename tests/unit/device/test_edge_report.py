@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bricktrack_device.edge_report import judge_edges
+from bricktrack_device.capture.edge_report import judge_edges
 
 T0 = 3_000_000_000_000
 P = 5_000_000  # 200 Hz

@@ -25,7 +25,7 @@ from bricktrack_common.wire_messages import (
     decode_reply,
     encode_message,
 )
-from bricktrack_device.file_server import Answer, FileServer
+from bricktrack_device.network.file_server import Answer, FileServer
 from bricktrack_device.refusals import RequestRefusedError
 
 DATA = bytes(range(256)) * 100

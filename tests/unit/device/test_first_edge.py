@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bricktrack_device.first_edge import Believed, FirstEdgeFinder
+from bricktrack_device.capture.first_edge import Believed, FirstEdgeFinder
 
 MS = 1_000_000
 P = 20 * MS  # 50 Hz

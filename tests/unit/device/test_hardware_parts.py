@@ -9,13 +9,13 @@ from gpiozero.pins.mock import MockFactory
 
 from bricktrack_common.errors import HardwareError
 from bricktrack_device.bounded import finishes
+from bricktrack_device.capture.ring import FrameRing
 from bricktrack_device.config import CameraTable, DeviceConfig
 from bricktrack_device.hardware import versions
 from bricktrack_device.hardware.led_bank import LedBank
 from bricktrack_device.hardware.pi_camera import PiCamera
 from bricktrack_device.hardware.pi_rig import PiRig, camera_settings
 from bricktrack_device.hardware.smbus_i2c import SmbusOpener
-from bricktrack_device.ring import FrameRing
 
 
 @pytest.mark.parametrize(

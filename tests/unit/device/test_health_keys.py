@@ -6,7 +6,7 @@ from bricktrack_common.errors import ConfigError
 from bricktrack_common.key_files import fingerprint, make_key_pair
 from bricktrack_device.config import DeviceConfig, ServerTable
 from bricktrack_device.health.keys import check_keys
-from bricktrack_device.key_folder import allow_client, create_unit_key, unit_public_key
+from bricktrack_device.network.key_folder import allow_client, create_unit_key, unit_public_key
 
 
 def with_keys(folder: Path) -> DeviceConfig:

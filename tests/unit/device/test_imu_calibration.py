@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from bricktrack_common.errors import StorageError
-from bricktrack_device.imu_calibration import load_calibration, save_calibration
+from bricktrack_device.inertial.imu_calibration import load_calibration, save_calibration
 
 CHIP = "0a" * 16
 FIRST, SECOND = bytes(range(22)), bytes(range(22, 44))

@@ -6,9 +6,9 @@ import pytest
 from device_fakes import FakeBusOpener
 
 from bricktrack_common.clocks import monotonic_ns
-from bricktrack_device import imu_reader
 from bricktrack_device.config import ImuTable, SamplerTable
-from bricktrack_device.imu_reader import ImuReader
+from bricktrack_device.inertial import imu_reader
+from bricktrack_device.inertial.imu_reader import ImuReader
 
 ORDINARY = SamplerTable(priority=0, lock_memory=False)
 

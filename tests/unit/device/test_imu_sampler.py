@@ -8,7 +8,7 @@ from device_fakes import FakeBus
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.imu_records import ImuRecord
 from bricktrack_device.config import SamplerTable
-from bricktrack_device.imu_sampler import ask_for_realtime, sample, sleep_until_ns
+from bricktrack_device.inertial.imu_sampler import ask_for_realtime, sample, sleep_until_ns
 
 MS = 1_000_000
 T0 = 1_000_000 * MS

@@ -7,15 +7,15 @@ from typer.testing import CliRunner
 
 from bricktrack_common.errors import BricktrackError, ConfigError, StorageError
 from bricktrack_common.key_files import make_key_pair
-from bricktrack_device.key_folder import (
+from bricktrack_device.network.key_folder import (
     allow_client,
     client_files,
     create_unit_key,
     forbid_client,
     unit_public_key,
 )
-from bricktrack_device.keys_cli import app
-from bricktrack_device.unit_keys import UnitKeys
+from bricktrack_device.network.keys_cli import app
+from bricktrack_device.network.unit_keys import UnitKeys
 
 
 def test_a_made_folder_is_what_the_daemon_reads(tmp_path: Path) -> None:

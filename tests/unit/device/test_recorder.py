@@ -14,8 +14,10 @@ from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Armed, Disarmed, Refusal, Reply
-from bricktrack_device import recorder as recorder_module
-from bricktrack_device import session as session_module
+from bricktrack_device.capture import recorder as recorder_module
+from bricktrack_device.capture import session as session_module
+from bricktrack_device.capture.recorder import Recorder
+from bricktrack_device.capture.session import Session
 from bricktrack_device.config import (
     CameraTable,
     DeviceConfig,
@@ -25,10 +27,8 @@ from bricktrack_device.config import (
     TriggerTable,
     UnitTable,
 )
-from bricktrack_device.disk import Disk
-from bricktrack_device.recorder import Recorder
-from bricktrack_device.run_store import RunStore
-from bricktrack_device.session import Session
+from bricktrack_device.storage.disk import Disk
+from bricktrack_device.storage.run_store import RunStore
 
 
 def config_for(folder: Path, **changes: object) -> DeviceConfig:

@@ -6,8 +6,8 @@ import pytest
 
 from bricktrack_common.errors import ConfigError, StorageError
 from bricktrack_device.config import CameraTable, DeviceConfig, RecordingTable, TriggerTable
-from bricktrack_device.disk import Disk
 from bricktrack_device.remote_settings import REMOTE_KEYS, RemoteSettings
+from bricktrack_device.storage.disk import Disk
 
 BASE = DeviceConfig(
     camera=CameraTable(exposure_us=1500),

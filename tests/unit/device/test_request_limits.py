@@ -1,4 +1,4 @@
-from bricktrack_device.request_limits import MAX_REMEMBERED, BusyBudget, PeerRates
+from bricktrack_device.network.request_limits import MAX_REMEMBERED, BusyBudget, PeerRates
 
 
 class Clock:

@@ -4,10 +4,10 @@ from pathlib import Path
 import pytest
 from run_folders import make_run
 
+from bricktrack_device.capture.retention import make_room
 from bricktrack_device.config import DeviceConfig, RecordingTable, StorageTable
-from bricktrack_device.disk import Disk
-from bricktrack_device.retention import make_room
-from bricktrack_device.run_store import RunStore
+from bricktrack_device.storage.disk import Disk
+from bricktrack_device.storage.run_store import RunStore
 
 RUN_BYTES = 1_000_000
 CARD_BYTES = 6_000_000

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from bricktrack_common.frame_times import FrameFlag
+from bricktrack_device.capture.ring import FrameRing, VideoCut, cut_video
 from bricktrack_device.interfaces import EncodedPacket, FrameMetadata
-from bricktrack_device.ring import FrameRing, VideoCut, cut_video
 
 PERIOD_NS = 33_327_000  # 30.0058 Hz, as an IMX219 runs when it is asked for 30
 T_NS = 7_000_000_123

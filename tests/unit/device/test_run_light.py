@@ -11,6 +11,8 @@ from device_fakes import FakeCamera, FakeRig
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Armed, Disarmed, Refusal, Reply
+from bricktrack_device.capture.recorder import Recorder
+from bricktrack_device.capture.run_light import RunLight
 from bricktrack_device.config import (
     CameraTable,
     DeviceConfig,
@@ -19,9 +21,7 @@ from bricktrack_device.config import (
     StorageTable,
     UnitTable,
 )
-from bricktrack_device.recorder import Recorder
-from bricktrack_device.run_light import RunLight
-from bricktrack_device.run_store import RunStore
+from bricktrack_device.storage.run_store import RunStore
 
 PINS = LedsTable(pins=["GPIO22", "GPIO27"])
 

@@ -15,15 +15,15 @@ from bricktrack_common.frame_times import FrameRecord
 from bricktrack_common.imu_records import ImuDescription, ImuRecord
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.run_manifest import CameraSection, ClocksSection, RunManifest, WaveSection
-from bricktrack_device.disk import Disk
+from bricktrack_device.capture.recording import ImuRecording, Recording, RunLog, save
+from bricktrack_device.capture.ring import VideoCut
+from bricktrack_device.capture.trigger import EdgeTrain
 from bricktrack_device.interfaces import EncodedPacket
-from bricktrack_device.recording import ImuRecording, Recording, RunLog, save
-from bricktrack_device.recovery import rebuild_manifest
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.ring import VideoCut
-from bricktrack_device.run_store import RunStore
-from bricktrack_device.run_writer import DRAFT_NAME
-from bricktrack_device.trigger import EdgeTrain
+from bricktrack_device.storage.disk import Disk
+from bricktrack_device.storage.recovery import rebuild_manifest
+from bricktrack_device.storage.run_store import RunStore
+from bricktrack_device.storage.run_writer import DRAFT_NAME
 
 T0 = 5_000_000_000
 BOOT = "b3f2a7d0-0000-0000-0000-000000000000"

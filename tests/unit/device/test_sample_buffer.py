@@ -3,7 +3,7 @@ from collections.abc import Iterator
 import pytest
 
 from bricktrack_common.imu_records import ImuRecord
-from bricktrack_device.sample_buffer import RECORD_BYTES, SampleBuffer
+from bricktrack_device.inertial.sample_buffer import RECORD_BYTES, SampleBuffer
 
 
 def record(slot: int) -> ImuRecord:

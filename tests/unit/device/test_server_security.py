@@ -20,11 +20,11 @@ from bricktrack_common.wire_messages import (
     decode_reply,
     encode_message,
 )
-from bricktrack_device import connection_guard, file_server
-from bricktrack_device.connection_guard import ConnectionGuard
-from bricktrack_device.file_server import Answer, FileServer
+from bricktrack_device.network import connection_guard, file_server
+from bricktrack_device.network.connection_guard import ConnectionGuard
+from bricktrack_device.network.file_server import Answer, FileServer
+from bricktrack_device.network.unit_keys import UnitKeys
 from bricktrack_device.priority import NICENESS
-from bricktrack_device.unit_keys import UnitKeys
 
 HELLO = HelloReply(unit="unit-1", software="test", simulated=True)
 

@@ -4,7 +4,7 @@ import pytest
 
 from bricktrack_common.errors import DeviceError
 from bricktrack_common.wire_messages import DaemonState
-from bricktrack_device.state_table import TRANSITIONS, Cause, StateMachine
+from bricktrack_device.capture.state_table import TRANSITIONS, Cause, StateMachine
 
 STATES = get_args(DaemonState)
 CAUSES = get_args(Cause)

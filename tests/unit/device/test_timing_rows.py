@@ -6,8 +6,8 @@ import pytest
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import ConfigError, HardwareError
 from bricktrack_device.backends import open_rig
+from bricktrack_device.capture.ring import VideoCut
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.ring import VideoCut
 from bricktrack_device.sim.led_switch import LedSwitch, SimLeds
 from bricktrack_device.sim.settings import SimFaults, SimSettings
 from bricktrack_device.sim.sim_rig import SimRig

@@ -4,8 +4,8 @@ import pytest
 from gpiozero.pins.mock import MockFactory, MockPin
 
 from bricktrack_common.errors import HardwareError
+from bricktrack_device.capture.trigger import Trigger
 from bricktrack_device.config import TriggerTable
-from bricktrack_device.trigger import Trigger
 
 MS = 1_000_000
 

@@ -6,7 +6,7 @@ import pytest
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.key_files import make_key_pair, write_public_key, write_secret_key
-from bricktrack_device.unit_keys import UnitKeys
+from bricktrack_device.network.unit_keys import UnitKeys
 
 
 def make_folder(folder: Path, **clients: str) -> Path:

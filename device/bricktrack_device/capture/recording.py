@@ -35,9 +35,9 @@ from bricktrack_common.run_manifest import (
     TriggerSection,
     WaveSection,
 )
-from bricktrack_device.ring import VideoCut
-from bricktrack_device.run_writer import RunWriter
-from bricktrack_device.trigger import EdgeTrain
+from bricktrack_device.capture.ring import VideoCut
+from bricktrack_device.capture.trigger import EdgeTrain
+from bricktrack_device.storage.run_writer import RunWriter
 
 _PACKAGES = (
     "bricktrack", "numpy", "pyzmq", "gpiozero", "adafruit-circuitpython-bno055", "lgpio", "picamera2", "av",

@@ -17,18 +17,18 @@ from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import StorageError
 from bricktrack_common.imu_records import FIRST_REGISTER, ImuDescription, ImuRecord
 from bricktrack_common.wire_messages import ImuStatus
-from bricktrack_device.bno055 import REG_CALIB_STAT
 from bricktrack_device.config import ImuTable, SamplerTable
-from bricktrack_device.imu_calibration import save_calibration
-from bricktrack_device.imu_sampler import (
+from bricktrack_device.inertial.bno055 import REG_CALIB_STAT
+from bricktrack_device.inertial.imu_calibration import save_calibration
+from bricktrack_device.inertial.imu_sampler import (
     SamplerCalibrated,
     SamplerFailed,
     SamplerJob,
     SamplerReady,
     sampler_main,
 )
+from bricktrack_device.inertial.sample_buffer import SampleBuffer
 from bricktrack_device.interfaces import BusOpener
-from bricktrack_device.sample_buffer import SampleBuffer
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from bricktrack_common.key_files import (
     write_public_key,
     write_secret_key,
 )
-from bricktrack_device.unit_keys import CLIENTS_NAME, UNIT_KEY_NAME
+from bricktrack_device.network.unit_keys import CLIENTS_NAME, UNIT_KEY_NAME
 
 DAEMON_USER = "bricktrack"
 _HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")

@@ -19,11 +19,17 @@ from pathlib import Path
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import BricktrackError, HardwareError
 from bricktrack_common.imu_records import FIRST_REGISTER, N_DATA_BYTES, AxisMap, ImuRecord
-from bricktrack_device.bno055 import N_STATUS_BYTES, REG_SYS_STATUS, SensorFacts, read_calibration, set_up
 from bricktrack_device.config import ImuMode, SamplerTable
-from bricktrack_device.imu_calibration import load_calibration
+from bricktrack_device.inertial.bno055 import (
+    N_STATUS_BYTES,
+    REG_SYS_STATUS,
+    SensorFacts,
+    read_calibration,
+    set_up,
+)
+from bricktrack_device.inertial.imu_calibration import load_calibration
+from bricktrack_device.inertial.sample_buffer import SampleBuffer
 from bricktrack_device.interfaces import BusOpener, I2cBus
-from bricktrack_device.sample_buffer import SampleBuffer
 
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1

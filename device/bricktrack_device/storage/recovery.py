@@ -21,7 +21,7 @@ from bricktrack_common.run_manifest import (
     TriggerSection,
     read_manifest,
 )
-from bricktrack_device.run_writer import DRAFT_NAME
+from bricktrack_device.storage.run_writer import DRAFT_NAME
 
 logger = logging.getLogger(__name__)
 

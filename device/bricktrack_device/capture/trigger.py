@@ -14,8 +14,8 @@ import gpiozero
 
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
+from bricktrack_device.capture.first_edge import FirstEdgeFinder
 from bricktrack_device.config import TriggerTable
-from bricktrack_device.first_edge import FirstEdgeFinder
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import zmq
 from zmq.utils import z85
 
 from bricktrack_common.key_files import fingerprint
-from bricktrack_device.unit_keys import UnitKeys
+from bricktrack_device.network.unit_keys import UnitKeys
 
 logger = logging.getLogger(__name__)
 

@@ -11,23 +11,22 @@ from typing import TypeVar
 from bricktrack_common.clocks import ClockTriplet, monotonic_ns, read_clock_triplet
 from bricktrack_common.errors import BricktrackError, HardwareError
 from bricktrack_common.run_manifest import CameraSection, ClocksSection
+from bricktrack_device.capture.edge_report import judge_edges
+from bricktrack_device.capture.recording import ImuRecording, Recording, RunLog
+from bricktrack_device.capture.ring import RING_SLACK_S, FrameRing, VideoCut, cut_video
+from bricktrack_device.capture.run_light import RunLight
+from bricktrack_device.capture.trigger import Trigger
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.edge_report import judge_edges
-from bricktrack_device.imu_reader import ImuReader
 from bricktrack_device.in_time import in_time
+from bricktrack_device.inertial.imu_reader import ImuReader
 from bricktrack_device.interfaces import Camera, Rig
-from bricktrack_device.recording import ImuRecording, Recording, RunLog
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.ring import FrameRing, VideoCut, cut_video
-from bricktrack_device.run_light import RunLight
-from bricktrack_device.trigger import Trigger
 
 logger = logging.getLogger(__name__)
 
 CAMERA_START_TIMEOUT_S = 30.0
 CAMERA_STOP_TIMEOUT_S = 5.0
 FIRST_KEYFRAME_TIMEOUT_S = 10.0
-RING_SLACK_S = 5.0
 LATE_FRAMES_GRACE_S = 1.0
 """How long after the window's end the last pictures may still come out of the encoder."""
 LATE_EDGES_GRACE_NS = 100_000_000

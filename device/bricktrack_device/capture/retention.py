@@ -3,9 +3,9 @@
 import logging
 
 from bricktrack_common.errors import BricktrackError
+from bricktrack_device.capture.room import disk_needed_bytes
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.room import disk_needed_bytes
-from bricktrack_device.run_store import RunStore
+from bricktrack_device.storage.run_store import RunStore
 
 logger = logging.getLogger(__name__)
 

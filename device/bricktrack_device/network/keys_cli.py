@@ -31,7 +31,7 @@ def create(
     As root, the files are given to the user bricktrack, whom the daemon runs as. A replaced key counts once
     the daemon is restarted; hosts must then have the new one.
     """
-    from bricktrack_device.key_folder import create_unit_key, unit_public_key
+    from bricktrack_device.network.key_folder import create_unit_key, unit_public_key
 
     is_new = create_unit_key(folder, replace=replace)
     _print_key(unit_public_key(folder), as_json=as_json, is_new=is_new)
@@ -42,7 +42,7 @@ def create(
 @app.command(epilog="Example:\n\n  sudo bricktrackd keys show\n")
 def show(folder: FolderOption = DEFAULT_FOLDER, as_json: JsonOption = False) -> None:
     """Print the unit's public key."""
-    from bricktrack_device.key_folder import unit_public_key
+    from bricktrack_device.network.key_folder import unit_public_key
 
     _print_key(unit_public_key(folder), as_json=as_json, is_new=False)
 
@@ -55,7 +55,7 @@ def allow(
 ) -> None:
     """Let a host speak to this unit; counts at once. A host may have two keys while it changes them."""
     from bricktrack_common.key_files import fingerprint
-    from bricktrack_device.key_folder import allow_client
+    from bricktrack_device.network.key_folder import allow_client
 
     known_as = allow_client(folder, name, public_key)
     typer.echo(f"{known_as} ({fingerprint(public_key)}) may speak to this unit")
@@ -67,7 +67,7 @@ def forbid(
     folder: FolderOption = DEFAULT_FOLDER,
 ) -> None:
     """Let a host speak to this unit no more; counts from its next connection on."""
-    from bricktrack_device.key_folder import forbid_client
+    from bricktrack_device.network.key_folder import forbid_client
 
     for name in forbid_client(folder, host):
         typer.echo(f"{name} may not speak to this unit any more")
@@ -77,7 +77,7 @@ def forbid(
 def list_clients(folder: FolderOption = DEFAULT_FOLDER, as_json: JsonOption = False) -> None:
     """List the hosts that may speak to this unit."""
     from bricktrack_common.key_files import fingerprint, read_public_key
-    from bricktrack_device.key_folder import client_files
+    from bricktrack_device.network.key_folder import client_files
 
     clients = {p.stem: read_public_key(p) for p in client_files(folder)}
     if as_json:

@@ -31,12 +31,12 @@ from bricktrack_common.wire_messages import (
     decode_request,
     encode_message,
 )
-from bricktrack_device.connection_guard import ConnectionGuard
-from bricktrack_device.gatekeeper import ZAP_DOMAIN, Gatekeeper
+from bricktrack_device.network.connection_guard import ConnectionGuard
+from bricktrack_device.network.gatekeeper import ZAP_DOMAIN, Gatekeeper
+from bricktrack_device.network.request_limits import PER_SECOND, BusyBudget, PeerRates
+from bricktrack_device.network.unit_keys import UnitKeys
 from bricktrack_device.priority import at_low_priority, lower_priority
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.request_limits import PER_SECOND, BusyBudget, PeerRates
-from bricktrack_device.unit_keys import UnitKeys
 
 logger = logging.getLogger(__name__)
 

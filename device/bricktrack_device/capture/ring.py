@@ -18,6 +18,8 @@ from bricktrack_device.interfaces import EncodedPacket, FrameMetadata
 JOIN_TOLERANCE_NS = 100_000
 """A packet's stamp is its frame's, truncated to us twice at most; the next frame is 100 times further."""
 GAP_PERIODS = 1.5
+RING_SLACK_S = 5.0
+"""What is held beyond the span of a run."""
 
 
 class FrameRing:

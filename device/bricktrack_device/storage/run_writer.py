@@ -12,7 +12,7 @@ import msgspec
 
 from bricktrack_common.run_manifest import MANIFEST_NAME, FileEntry, RunManifest, file_entry
 from bricktrack_common.typed_data import dump_json
-from bricktrack_device.disk import Disk, storage_error
+from bricktrack_device.storage.disk import Disk, storage_error
 
 PARTIAL_SUFFIX = ".partial"
 DRAFT_NAME = "draft.json"

@@ -39,9 +39,9 @@ from bricktrack_common.run_manifest import (
 )
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_common.wire_messages import ErrorCode, FileSummary, RunDescription, RunSummary
-from bricktrack_device.disk import Disk, storage_error
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.run_writer import DRAFT_NAME, PARTIAL_SUFFIX, RunWriter
+from bricktrack_device.storage.disk import Disk, storage_error
+from bricktrack_device.storage.run_writer import DRAFT_NAME, PARTIAL_SUFFIX, RunWriter
 
 logger = logging.getLogger(__name__)
 

@@ -14,8 +14,8 @@ import msgspec
 
 from bricktrack_common.errors import RunFormatError, StorageError
 from bricktrack_common.typed_data import dump_json, load_json
-from bricktrack_device.bno055 import N_CALIBRATION_BYTES
 from bricktrack_device.config import ImuMode
+from bricktrack_device.inertial.bno055 import N_CALIBRATION_BYTES
 
 logger = logging.getLogger(__name__)
 

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from bricktrack_device.capture.ring import RING_SLACK_S
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.run_store import RunStore
-from bricktrack_device.session import RING_SLACK_S
+from bricktrack_device.storage.run_store import RunStore
 
 MEMORY_MARGIN = 1.3
 """Times the video that is held: the run is cut out of it by reference, not copied."""

@@ -23,17 +23,17 @@ from bricktrack_common.wire_messages import (
     Refusal,
     Reply,
 )
+from bricktrack_device.capture.recording import Recording, save
+from bricktrack_device.capture.retention import make_room
+from bricktrack_device.capture.room import check_room, disk_needed_bytes
+from bricktrack_device.capture.run_light import RunLight
+from bricktrack_device.capture.session import Session
+from bricktrack_device.capture.state_table import Cause, StateMachine
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.interfaces import Rig
-from bricktrack_device.recording import Recording, save
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.retention import make_room
-from bricktrack_device.room import check_room, disk_needed_bytes
-from bricktrack_device.run_light import RunLight
-from bricktrack_device.run_store import RunStore
-from bricktrack_device.run_writer import RunWriter
-from bricktrack_device.session import Session
-from bricktrack_device.state_table import Cause, StateMachine
+from bricktrack_device.storage.run_store import RunStore
+from bricktrack_device.storage.run_writer import RunWriter
 
 logger = logging.getLogger(__name__)
 

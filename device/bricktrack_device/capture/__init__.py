@@ -1,0 +1,1 @@
+"""A run from the first edge to the files: trigger, ring, session, recorder."""

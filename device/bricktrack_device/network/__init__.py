@@ -1,0 +1,1 @@
+"""The socket: file server, keys, limits, and the advertisement on the network."""

@@ -1,0 +1,1 @@
+"""Runs on the card: written durably, found again, given to the host."""
