@@ -293,7 +293,7 @@ def fused_result(
 ) -> FusionResult:
     """Return what is given out of one smoothed run; ``track`` where the motion was sampled already."""
     n = len(s.nodes.t_s)
-    x, P = s.estimate.state.x[:n, s.b], s.estimate.covariance[:n, s.b]
+    x, variance = s.estimate.state.x[:n, s.b], s.estimate.variance[:n, s.b]
     n_frames = len(item.optical.t_ns)
     chi2, rejected = np.full(n_frames, np.nan), np.zeros(n_frames, dtype=np.bool_)
     chi2[s.run.frame], rejected[s.run.frame] = s.chi2, ~s.used
@@ -308,7 +308,7 @@ def fused_result(
             settings=settings, is_smoothed=is_smoothed,
         )  # fmt: skip
 
-    sd = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2).mean(axis=0), 0.0))
+    sd = np.sqrt(np.maximum(variance.mean(axis=0), 0.0))
     return FusionResult(
         track=track or sample(s.estimate, is_smoothed=True),
         forward=sample(s.passed.forward(), is_smoothed=False) if with_forward else None,

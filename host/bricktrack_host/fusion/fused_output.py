@@ -102,6 +102,7 @@ def sample_motion(
     state = State(R_t, np.concatenate([x[:, :3], p, v, x[:, 9:]], axis=1))
     zero = np.zeros(len(t))
     R_out, p_out, H = observe(state, omega, run.lever_arm_m, t_cam - run.t_mid_s, zero)
+    H = H[..., estimate.of]
     P = H @ cov @ np.swapaxes(H, 1, 2)
     _add_bridge(P, problem, k, b, dt, nodes, is_smoothed=is_smoothed)
     P = P + common

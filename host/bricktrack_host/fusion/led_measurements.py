@@ -10,8 +10,8 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, NoiseLevel, Run, noise_parts
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import seconds_since
+from bricktrack_host.fusion.observation_kernel import LedArrays
 from bricktrack_host.fusion.smoother import Estimate, Problem
-from bricktrack_host.fusion.smoother_kernel import LedArrays, led_residuals
 from bricktrack_host.tracking.led_profile import collar_of, predict_brick
 from bricktrack_host.tracking.led_tracker import NOT_USED
 from bricktrack_host.tracking.optical_track import led_times_ns
@@ -165,13 +165,7 @@ def led_chi2(problem: Problem, estimate: Estimate) -> FloatArray:
     leds = problem.leds
     if leds is None:
         raise ValueError("the problem has no LEDs")
-    n = len(leds.dt_s)
-    y, A = np.empty((n, 2)), np.empty((n, 2, 2))
-    off_lin = np.append(problem.ba_lin[0], [problem.lag_lin[0], problem.loss_lin[0]])
-    led_residuals(
-        leds, 0, estimate.state.R, estimate.state.x, estimate.covariance, problem.lever_arm_m[0],
-        problem.bg_lin[0], off_lin, problem.tau_lin[0], problem.skew_lin[0], y, A,
-    )  # fmt: skip
+    y, A = estimate.led_residual_px, estimate.led_cov_px2
     given = leds.cov_px2 * leds.inflation[:, None, None]
     rest = np.linalg.inv(1.02 * given - A)
     S = leds.cov_px2 + np.where(leds.use[:, None, None], A + A @ rest @ A, A)

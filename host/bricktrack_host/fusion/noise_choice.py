@@ -44,6 +44,7 @@ def frame_chi2(
     """
     at = nodes.node_of_frame
     r, H = residuals(problem, estimate.state, at, b)
+    H = H[..., estimate.of]
     A = H @ estimate.covariance[at, b] @ np.swapaxes(H, -1, -2)
     stated = problem.cov_seen[at, b]
     given = stated * passed.inflation[at, b][:, None, None]

@@ -40,7 +40,7 @@ def _piece_of(knots_s: FloatArray, t_s: float, near: int) -> int:
     last = len(knots_s) - 2
     i = min(max(near, 0), last)
     if not knots_s[max(i - 4, 0)] <= t_s <= knots_s[min(i + 5, last + 1)]:
-        i = min(max(np.searchsorted(knots_s, t_s, side="right") - 1, 0), last)
+        i = min(max(int(np.searchsorted(knots_s, t_s, side="right")) - 1, 0), last)
     while i < last and t_s >= knots_s[i + 1]:
         i += 1
     while i > 0 and t_s < knots_s[i]:

@@ -4,20 +4,30 @@ The equations are DESIGN 8.2's. SI units inside. Error state, 22 components: att
 and velocity of the IMU point (camera axes), gyro and accelerometer bias, gravity (camera axes), time offset,
 clock skew, accelerometer-minus-gyro lag, and what the accelerometer's low-pass takes from its second
 derivative. Arrays put time first and the runs of the batch second; a run shorter than the others is padded
-with empty steps. The loops over time are compiled (`smoother_kernel`).
+with empty steps. The loops over time are compiled (`smoother_kernel`, `smoother_backward`).
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
-from bricktrack_host.fusion.smoother_kernel import LedArrays, backward_pass, forward_pass
+from bricktrack_host.fusion.observation_kernel import LedArrays
+from bricktrack_host.fusion.smoother_backward import backward_pass
+from bricktrack_host.fusion.smoother_kernel import CHUNK, RunArrays, forward_pass, states_before_frames
 
+T = TypeVar("T", bound=np.generic)
+_THREADS = min(4, os.cpu_count() or 1)
 N_STATES = 22
 ATT, POS, VEL, BG, BA, GRAV = (slice(3 * i, 3 * i + 3) for i in range(6))
 TAU, SKEW, LAG, LOSS = 18, 19, 20, 21
+SEEN = np.array([0, 1, 2, 3, 4, 5, TAU, SKEW])
+"""Attitude, position, offset and skew: all that a picture, or an instant of the output, depends on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,19 +113,30 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """States at all nodes with covariance.
+    """States at all nodes, with as much of their covariance as is asked for.
 
     Attributes
     ----------
     state : State, leading shape (K, B)
-    covariance : ndarray, shape (K, B, 22, 22)
+    covariance : ndarray, shape (K, B, c, c)
+        Of the states `of`.
+    of : ndarray of int64, shape (c,)
+        By default `SEEN`: the whole would be 4 kB a node.
+    variance : ndarray, shape (K, B, 22)
+        Of every state.
     nis : ndarray, shape (K, B)
         Innovation squared over its covariance (6 degrees of freedom), NaN where no frame; only of the filter.
+    led_residual_px, led_cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
+        Of each LED at the state of its node: seen less predicted, and H P H^T; empty where there are no LEDs.
     """
 
     state: State
     covariance: FloatArray
+    of: IntArray
+    variance: FloatArray
     nis: FloatArray
+    led_residual_px: FloatArray
+    led_cov_px2: FloatArray
 
 
 def _matvec(A: FloatArray, v: FloatArray) -> FloatArray:
@@ -168,17 +189,22 @@ def observe(
 
 def residuals(problem: Problem, state: State, at: IntArray, b: int) -> tuple[FloatArray, FloatArray]:
     """Return optical residuals, shape (n, 6), and Jacobians, shape (n, 6, 22), at nodes of one run."""
-    R_at, x = state.R[at, b], state.x[at, b]
+    return residuals_of(problem, State(state.R[at, b], state.x[at, b]), at, b)
+
+
+def residuals_of(problem: Problem, state: State, at: IntArray, b: int) -> tuple[FloatArray, FloatArray]:
+    """Return the same as `residuals` for states, shape (n,), of nodes ``at`` alone."""
+    x = state.x
     since_mid = problem.since_mid_s[at, b]
     dt = (x[:, TAU] - problem.tau_lin[b]) + since_mid * (x[:, SKEW] - problem.skew_lin[b])
     omega = problem.omega_radps[at, b] - x[:, BG]
     camera = problem.camera_omega_radps[at, b]
-    R, p, H = observe(State(R_at, x), omega, problem.lever_arm_m[b], since_mid, dt, camera_omega_radps=camera)
+    R, p, H = observe(state, omega, problem.lever_arm_m[b], since_mid, dt, camera_omega_radps=camera)
     turn = rvec_from_matrix(np.swapaxes(R, -1, -2) @ problem.R_seen[at, b])
     return np.concatenate([turn, problem.p_seen_m[at, b] - p], axis=-1), H
 
 
-def _sensitivities(problem: Problem) -> FloatArray:
+def sensitivities(problem: Problem) -> FloatArray:
     """Return, in body axes, what changes dv: attitude, accelerometer bias, lag, loss; then the same for dp.
 
     Shape (K - 1, B, 6, 8): rows dv, dp; columns theta (3), ba (3), lag, loss.
@@ -195,21 +221,10 @@ def _sensitivities(problem: Problem) -> FloatArray:
     return out
 
 
-_Kept = tuple[
-    bool,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-]
-
-
 class Filter:
-    """The forward pass over a batch, kept whole, so that the smoother can run back over it.
+    """The forward pass over a batch; `smooth` runs back over it.
+
+    Only every `CHUNK`-th state is kept: the way back makes the others again as it needs them.
 
     Attributes
     ----------
@@ -224,19 +239,29 @@ class Filter:
     def __init__(self, problem: Problem) -> None:
         n_nodes, n_runs = problem.has_frame.shape
         self._problem = problem
-        self._effect = _sensitivities(problem)
-        self.R = np.empty((n_nodes, n_runs, 3, 3))
-        self.x = np.empty((n_nodes, n_runs, N_STATES))
-        self.P = np.empty((n_nodes, n_runs, N_STATES, N_STATES))
-        self._predicted = (np.empty_like(self.R), np.empty_like(self.x), np.empty_like(self.P))
-        self.nis = np.full((n_nodes, n_runs), np.nan)
-        self.inflation = np.ones((n_nodes, n_runs))
+        self._runs = [_arrays_of(problem, b) for b in range(n_runs)]
+        n_kept = -(-n_nodes // CHUNK)
+        R, x = np.empty((n_runs, n_kept, 3, 3)), np.empty((n_runs, n_kept, N_STATES))
+        P = np.empty((n_runs, n_kept, N_STATES, N_STATES))
+        self._before = R, x, P
+        # One run after the other in memory; seen with time first, as everything else.
+        self.nis = np.full((n_runs, n_nodes), np.nan).T
+        self.inflation = np.ones((n_runs, n_nodes)).T
         self.log_likelihood = np.zeros(n_runs)
-        kept = (True, self.R, self.x, self.P, *self._predicted, self.nis, self.inflation)
-        for b in range(n_runs):
-            self.log_likelihood[b], _ = _forward(
-                problem, b, self._effect, problem.gyro_var[:, b], problem.acc_var[:, b], kept
-            )
+        for b, run in enumerate(self._runs):
+            gyro_var, acc_var = self._noise_of(b)
+            self.log_likelihood[b] = forward_pass(
+                run, gyro_var, acc_var, *_start_of(problem, b), self.nis.T[b], self.inflation.T[b],
+                R[b], x[b], P[b],
+            )  # fmt: skip
+
+    def attitudes(self) -> FloatArray:
+        """Return the filter's attitudes, each knowing only the past, shape (K, B, 3, 3)."""
+        return self.forward().state.R
+
+    def _noise_of(self, b: int) -> tuple[FloatArray, FloatArray]:
+        pr = self._problem
+        return np.ascontiguousarray(pr.gyro_var[:, b]), np.ascontiguousarray(pr.acc_var[:, b])
 
     def mean_nis(self, b: int) -> float:
         """Return the mean of `nis` of one run: 6 of frames, 2 of LEDs, when all is as believed."""
@@ -244,30 +269,49 @@ class Filter:
         nis = self.nis[:, b] if leds is None else leds.nis[leds.use]
         return float(np.nanmean(nis)) if np.isfinite(nis).any() else float("nan")
 
-    def forward(self) -> Estimate:
-        """Return the filtered states: each knows only the past."""
-        return Estimate(State(self.R, self.x), self.P, self.nis)
+    def predicted(self, at: IntArray, b: int) -> tuple[State, FloatArray]:
+        """Return states and covariances of one run at rising nodes, before what was seen there."""
+        R, x, P = (
+            np.empty((len(at), 3, 3)),
+            np.empty((len(at), N_STATES)),
+            np.empty((len(at), N_STATES, N_STATES)),
+        )
+        states_before_frames(
+            self._runs[b], *self._noise_of(b), *_start_of(self._problem, b), np.asarray(at, dtype=np.int64),
+            R, x, P,
+        )  # fmt: skip
+        return State(R, x), P
 
-    def smooth(self) -> Estimate:
-        """Return the states given all frames (Rauch, Tung and Striebel)."""
-        R, x, P = np.empty_like(self.R), np.empty_like(self.x), np.empty_like(self.P)
-        pr = self._problem
-        for b in range(len(self.log_likelihood)):
+    def forward(self, of: IntArray = SEEN) -> Estimate:
+        """Return the filtered states: each knows only the past."""
+        return self._estimate(of, is_smoothed=False)
+
+    def smooth(self, of: IntArray = SEEN) -> Estimate:
+        """Return the states given all frames, with the covariance of the states ``of``."""
+        return self._estimate(of, is_smoothed=True)
+
+    def _estimate(self, of: IntArray, *, is_smoothed: bool) -> Estimate:
+        n_nodes, n_runs = self.nis.shape
+        R, x = np.empty((n_runs, n_nodes, 3, 3)), np.empty((n_runs, n_nodes, N_STATES))
+        variance = np.empty((n_runs, n_nodes, N_STATES))
+        covariance = np.empty((n_runs, n_nodes, len(of), len(of)))
+        n_leds = 0 if self._problem.leds is None else len(self._problem.leds.dt_s)
+        led_residual_px, led_cov_px2 = np.empty((n_leds, 2)), np.empty((n_leds, 2, 2))
+        R_before, x_before, P_before = self._before
+        for b, run in enumerate(self._runs):
             backward_pass(
-                b,
-                pr.dt_s,
-                pr.R_step,
-                self._effect,
-                pr.known,
-                self.R,
-                self.x,
-                self.P,
-                *self._predicted,
-                R,
-                x,
-                P,
-            )
-        return Estimate(State(R, x), P, self.nis)
+                run, *self._noise_of(b), R_before[b], x_before[b], P_before[b], of, is_smoothed,
+                R[b], x[b], variance[b], covariance[b], led_residual_px, led_cov_px2,
+            )  # fmt: skip
+        return Estimate(
+            state=State(R.swapaxes(0, 1), x.swapaxes(0, 1)),
+            covariance=covariance.swapaxes(0, 1),
+            of=of,
+            variance=variance.swapaxes(0, 1),
+            nis=self.nis,
+            led_residual_px=led_residual_px,
+            led_cov_px2=led_cov_px2,
+        )
 
 
 def score_noise(problem: Problem, gyro_var: FloatArray, acc_var: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -284,22 +328,30 @@ def score_noise(problem: Problem, gyro_var: FloatArray, acc_var: FloatArray) -> 
         Of what stands still, all that the run tells.
     """
     n_runs, n_choices = gyro_var.shape[:2]
-    effect = _sensitivities(problem)
     log_likelihood = np.zeros((n_runs, n_choices))
     last = np.zeros((n_runs, n_choices, N_STATES))
-    for b in range(n_runs):
-        for i in range(n_choices):
-            log_likelihood[b, i], last[b, i] = _forward(
-                problem, b, effect, gyro_var[b, i], acc_var[b, i], _nothing_kept(problem)
-            )
+    runs = [_arrays_of(problem, b) for b in range(n_runs)]
+
+    def score(which: tuple[int, int]) -> None:
+        b, i = which
+        R, x, P = _start_of(problem, b)
+        log_likelihood[b, i] = forward_pass(
+            runs[b], np.ascontiguousarray(gyro_var[b, i]), np.ascontiguousarray(acc_var[b, i]), R, x, P,
+            np.empty(len(problem.has_frame)), np.empty(len(problem.has_frame)),
+            np.empty((0, 3, 3)), np.empty((0, N_STATES)), np.empty((0, N_STATES, N_STATES)),
+        )  # fmt: skip
+        last[b, i] = x
+
+    with ThreadPoolExecutor(_THREADS) as threads:  # compiled loops hold no lock
+        list(threads.map(score, np.ndindex(n_runs, n_choices)))
     return log_likelihood, last
 
 
-def _no_leds(shape: tuple[int, ...]) -> LedArrays:
+def _no_leds(n_nodes: int) -> LedArrays:
     none, none3 = np.empty(0), np.empty((0, 3))
     none33 = np.empty((0, 3, 3))
     return LedArrays(
-        first=np.zeros((shape[0] + 1, shape[1]), dtype=np.int64),
+        first=np.zeros((n_nodes + 1, 1), dtype=np.int64),
         use=np.zeros(0, dtype=np.bool_),
         dt_s=none, since_mid_s=none, R_step=none33, dv_mps=none3, dp_m=none3, omega_radps=none3,
         R_lin=none33, t_lin_m=none3, residual_px=np.empty((0, 2)), J=np.empty((0, 2, 6)),
@@ -307,32 +359,26 @@ def _no_leds(shape: tuple[int, ...]) -> LedArrays:
     )  # fmt: skip
 
 
-def _nothing_kept(problem: Problem) -> _Kept:
-    none3, none2 = np.empty((0, 0, 3, 3)), np.empty((0, 0, N_STATES))
-    none4 = np.empty((0, 0, N_STATES, N_STATES))
-    scratch = np.empty(problem.has_frame.shape), np.empty(problem.has_frame.shape)
-    return (False, none3, none2, none4, none3, none2, none4, *scratch)
-
-
-def _forward(
-    problem: Problem,
-    b: int,
-    effect: FloatArray,
-    gyro_var: FloatArray,
-    acc_var: FloatArray,
-    kept: _Kept,
-) -> tuple[float, FloatArray]:
-    """Run the filter over one run of a batch; return the log-likelihood and the last state."""
+def _arrays_of(problem: Problem, b: int) -> RunArrays:
+    """Return one run of a batch for the compiled loops."""
     pr = problem
-    x = pr.start.x[b].copy()
-    log_likelihood = forward_pass(
-        b, pr.dt_s, pr.R_step, pr.dv_mps, pr.dp_m, effect, pr.known,
-        np.ascontiguousarray(gyro_var), np.ascontiguousarray(acc_var),
-        pr.gyro_bias_walk, pr.acc_bias_walk, pr.omega_radps, pr.camera_omega_radps,
-        pr.has_frame, pr.R_seen, pr.p_seen_m, pr.cov_seen, pr.since_mid_s,
-        pr.lever_arm_m[b], pr.bg_lin[b], np.append(pr.ba_lin[b], [pr.lag_lin[b], pr.loss_lin[b]]),
-        pr.tau_lin[b], pr.skew_lin[b],
-        pr.start.R[b].copy(), x, pr.P_start[b].copy(), *kept,
-        pr.leds or _no_leds(pr.has_frame.shape),
+
+    def own(values: NDArray[T]) -> NDArray[T]:
+        return np.ascontiguousarray(values[:, b])
+
+    return RunArrays(
+        dt_s=own(pr.dt_s), R_step=own(pr.R_step), R_half=own(pr.R_half), dv_mps=own(pr.dv_mps),
+        dp_m=own(pr.dp_m), f_rate_mps3=own(pr.f_rate_mps3), f_curve_mps4=own(pr.f_curve_mps4),
+        known=own(pr.known), gyro_walk=own(pr.gyro_bias_walk), acc_walk=own(pr.acc_bias_walk),
+        omega_radps=own(pr.omega_radps), camera_omega_radps=own(pr.camera_omega_radps),
+        has_frame=own(pr.has_frame), R_seen=own(pr.R_seen), p_seen_m=own(pr.p_seen_m),
+        cov_seen=own(pr.cov_seen), since_mid_s=own(pr.since_mid_s), arm_m=pr.lever_arm_m[b],
+        bg_lin=pr.bg_lin[b], off_lin=np.append(pr.ba_lin[b], [pr.lag_lin[b], pr.loss_lin[b]]),
+        tau_lin=float(pr.tau_lin[b]), skew_lin=float(pr.skew_lin[b]),
+        leds=pr.leds or _no_leds(len(pr.has_frame)),
     )  # fmt: skip
-    return float(log_likelihood), x
+
+
+def _start_of(problem: Problem, b: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return attitude, state and covariance to start from, which the filter then changes."""
+    return problem.start.R[b].copy(), problem.start.x[b].copy(), problem.P_start[b].copy()

@@ -8,8 +8,8 @@ from daemon_runs import simulate_run
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.led_measurements import SeenLeds
+from bricktrack_host.fusion.observation_kernel import LedArrays, observe_led
 from bricktrack_host.fusion.smoother import ATT, N_STATES, POS, VEL
-from bricktrack_host.fusion.smoother_kernel import LedArrays, observe_led
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.tracking.optical_track import solve_poses
 
