@@ -6,9 +6,10 @@ whenever a worker dies.
 """
 
 import hashlib
+import os
 import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from bricktrack_common.checksums import sha256_bytes, sha256_file
 from bricktrack_common.errors import BricktrackError, ConfigError, TransferError
@@ -34,10 +35,12 @@ class Parcel:
     ----------
     run : Path
         Where the run is on this machine, and perhaps for the worker too.
-    manifest_sha256 : str
-        Of its manifest, by which the worker knows that a folder is this run.
+    known_by : dict of str to str
+        SHA-256 of files by their path from ``run``, by which the worker knows that they are there: the run's
+        manifest, and what names the motion of a camera that moves.
     files : dict of str to bytes, or None
-        The run's own; `None`: the worker shall find them at ``run``.
+        All that is read of the run, and of another one if its sensor moves with the camera, by their path
+        from ``run``; `None`: the worker shall find them there.
     calibration, layout : bytes
     truth : (str, bytes) or None
         Name and contents.
@@ -47,7 +50,7 @@ class Parcel:
     """
 
     run: Path
-    manifest_sha256: str
+    known_by: dict[str, str]
     files: Files | None
     calibration: bytes
     layout: bytes
@@ -79,23 +82,32 @@ def pack(job: RunJob, *, as_bytes: bool) -> Parcel:
         If something of it cannot be read.
     """
     run = job.run.resolve()
-    manifest = read_manifest(run / MANIFEST_NAME)
+    names = _names_of(run, "")
+    known_by = [MANIFEST_NAME]
+    sensor = job.settings.camera_sensor
+    if sensor is not None and sensor.source:
+        others = [sensor.source] if sensor.kind == "table" else _names_of(run, f"{sensor.source}/")
+        names += others
+        known_by.append(others[0])
     truth = job.truth_file()
     with storage_errors(run, "Is it all there?"):
-        files = None
-        if as_bytes:
-            present = [f.name for f in manifest.files if (run / f.name).is_file()]
-            files = {name: (run / name).read_bytes() for name in (MANIFEST_NAME, *present)}
         return Parcel(
             run=run,
-            manifest_sha256=sha256_file(run / MANIFEST_NAME),
-            files=files,
+            known_by={name: sha256_file(run / name) for name in known_by},
+            files={name: (run / name).read_bytes() for name in names} if as_bytes else None,
             calibration=job.calibration.read_bytes(),
             layout=job.layout.read_bytes(),
             truth=None if truth is None else (truth.name, truth.read_bytes()),
             settings=job.settings,
             software=identity(),
         )
+
+
+def _names_of(run: Path, where: str) -> list[str]:
+    """Return what is there of a run, the manifest first, as seen from ``run``."""
+    listed = read_manifest(run / f"{where}{MANIFEST_NAME}").files
+    present = [where + f.name for f in listed if (run / f"{where}{f.name}").is_file()]
+    return [where + MANIFEST_NAME, *present]
 
 
 def process_parcel(parcel: Parcel, progress: RunProgress) -> Returned | NotThere:
@@ -114,7 +126,7 @@ def process_parcel(parcel: Parcel, progress: RunProgress) -> Returned | NotThere
     with tempfile.TemporaryDirectory(prefix="bricktrack-") as name:
         scratch = Path(name)
         run = _unpacked(parcel, scratch) if parcel.files is not None else parcel.run
-        if parcel.files is None and not _is_this_run(run, parcel.manifest_sha256):
+        if parcel.files is None and not _is_there(run, parcel.known_by):
             return NotThere()
         try:
             return _processed(parcel, run, scratch, progress)
@@ -122,19 +134,26 @@ def process_parcel(parcel: Parcel, progress: RunProgress) -> Returned | NotThere
             raise type(e)(str(e).replace(str(run), str(parcel.run))) from e
 
 
-def _is_this_run(folder: Path, manifest_sha256: str) -> bool:
+def _is_there(run: Path, known_by: dict[str, str]) -> bool:
     try:
-        return sha256_file(folder / MANIFEST_NAME) == manifest_sha256
+        return all(sha256_file(run / name) == sha256 for name, sha256 in known_by.items())
     except OSError:
         return False
 
 
 def _unpacked(parcel: Parcel, scratch: Path) -> Path:
-    folder = scratch / parcel.run.name
-    folder.mkdir()
-    for name, data in (parcel.files or {}).items():
-        (folder / name).write_bytes(data)
-    return folder
+    """Write a run's files as far down as the paths to its others lead up."""
+    files = parcel.files or {}
+    depth = max(PurePosixPath(name).parts.count("..") for name in files)
+    run = scratch.joinpath(*["up"] * depth, parcel.run.name)
+    run.mkdir(parents=True)
+    for name, data in files.items():
+        path = Path(os.path.normpath(run / name))
+        if not path.is_relative_to(scratch):
+            raise ConfigError(f"{name}: cannot be sent; it must be named relative to the run")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return run
 
 
 def _processed(parcel: Parcel, run: Path, scratch: Path, progress: RunProgress) -> Returned:

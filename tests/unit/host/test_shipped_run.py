@@ -14,6 +14,7 @@ from bricktrack_host.many_runs.run_job import RunJob, is_processed
 from bricktrack_host.many_runs.shipped_run import NotThere, pack, process_parcel, publish
 from bricktrack_host.pipeline import ProcessedRun, ProcessSettings
 from bricktrack_host.results.result_store import earlier_results, read_result, write_results
+from bricktrack_host.stages.camera_sensor import CameraSensor
 
 
 @pytest.fixture
@@ -98,9 +99,46 @@ def test_a_worker_without_the_path_says_so(job, processing):
     parcel = pack(job, as_bytes=False)
     elsewhere = replace(parcel, run=job.run.with_name("not-here"))
     assert process_parcel(elsewhere, Quiet()) == NotThere()
-    other_run = replace(parcel, manifest_sha256="0" * 64)
+    other_run = replace(parcel, known_by={MANIFEST_NAME: "0" * 64})
     assert process_parcel(other_run, Quiet()) == NotThere()
     assert processing == []
+
+
+def test_what_feels_a_moving_camera_is_sent_along(job, tmp_path, processing, monkeypatch):
+    other = tmp_path / "runs" / "b7-2_0001_shake"
+    other.mkdir()
+    (other / "imu_brick.msgpack").write_bytes(b"samples")
+    (other / "video.h264").write_bytes(b"other pictures")
+    files = [file_entry(other / "imu_brick.msgpack"), file_entry(other / "video.h264")]
+    write_manifest(
+        other / MANIFEST_NAME, msgspec.structs.replace(example.example_result().manifest, files=files)
+    )
+    table = tmp_path / "table.csv"
+    table.write_text("a,b,c")
+    turned = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    original = shipped_run.process_run
+
+    def looks_beside(run, *, settings, **options):
+        source = run / settings.camera_sensor.source
+        if settings.camera_sensor.kind == "table":
+            assert source.read_text() == "a,b,c"
+        else:
+            assert (source / "imu_brick.msgpack").read_bytes() == b"samples"
+            assert (source / MANIFEST_NAME).read_bytes() == (other / MANIFEST_NAME).read_bytes()
+        return original(run, settings=settings, **options)
+
+    monkeypatch.setattr(shipped_run, "process_run", looks_beside)
+    for sensor in (
+        CameraSensor(kind="table", source="../../table.csv", rotation=turned),
+        CameraSensor(kind="imu", source="../b7-2_0001_shake", imu="brick", rotation=turned),
+    ):
+        moving = replace(job, settings=ProcessSettings(camera=sensor.kind, camera_sensor=sensor))
+        assert sent(moving, as_bytes=True).run_id == job.run.name
+        assert job.run not in processing
+        parcel = pack(moving, as_bytes=False)
+        assert len(parcel.known_by) == 2
+        without = replace(parcel, known_by=dict.fromkeys(parcel.known_by, "0" * 64))
+        assert process_parcel(without, Quiet()) == NotThere()
 
 
 def test_errors_name_the_run_where_it_is_here(job, monkeypatch):
