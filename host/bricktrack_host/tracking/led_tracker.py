@@ -118,6 +118,7 @@ def observe_leds(
         out.cov_px2[i, leds] = blobs.cov_px2[index]
         out.area_px2[i, leds] = blobs.area_px2[index]
         out.led_flags[i, leds] = blobs.flags[index]
+    out.led_flags[found.is_strayed] |= int(LedFlag.PARTLY_COVERED)
     R, t = found.R_camera_brick, found.t_camera_brick_mm
     _flag_areas(out, R, t, ray_model, brick_model)
     _widen_blurred(out)

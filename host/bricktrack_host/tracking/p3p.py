@@ -1,14 +1,20 @@
-"""Poses from three rays and three LEDs: at most four of each, by Grunert's quartic, vectorised.
+"""Poses from three rays and three LEDs: at most four of each, by Grunert's quartic, compiled.
 
 Needs rays through one point; for a camera without one, the point nearest to all rays serves, and the poses
 are starts for the refinement, which asks the ray model itself.
 """
 
+import math
+
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.camera_model import RayModel
-from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.compiled import compiled
+
+_DOUBLE_ROOT = 0.02
+"""Noise makes a double root a pair with an imaginary part: up to this share of it, its real part serves."""
+_SLIM = 0.05  # sine of the angle at the first point below which three points are in line
 
 
 def ray_centre_mm(ray_model: RayModel) -> FloatArray:
@@ -44,7 +50,7 @@ def solve_p3p(bearings: FloatArray, points_mm: FloatArray) -> tuple[FloatArray, 
     Returns
     -------
     R : ndarray, shape (n, 4, 3, 3)
-        Brick to camera.
+        Brick to camera; NaN where not valid.
     t_mm : ndarray, shape (n, 4, 3), mm, from the rays' common point
     valid : ndarray of bool, shape (n, 4)
 
@@ -52,66 +58,208 @@ def solve_p3p(bearings: FloatArray, points_mm: FloatArray) -> tuple[FloatArray, 
     -----
     Haralick et al., 1994, eqs 8-11 (Grunert): quartic in v = s3 / s1, the ratio of two of the distances.
     """
-    f1, f2, f3 = bearings[:, 0], bearings[:, 1], bearings[:, 2]
-    p1, p2, p3 = points_mm[:, 0], points_mm[:, 1], points_mm[:, 2]
-    a2 = ((p2 - p3) ** 2).sum(axis=1)
-    b2 = ((p1 - p3) ** 2).sum(axis=1)
-    c2 = ((p1 - p2) ** 2).sum(axis=1)
-    ca, cb, cg = (f2 * f3).sum(axis=1), (f1 * f3).sum(axis=1), (f1 * f2).sum(axis=1)
-    d, e, k = (a2 - c2) / b2, (a2 + c2) / b2, c2 / b2
-    coefficients = np.stack(
-        [
-            (d - 1) ** 2 - 4 * k * ca**2,
-            4 * (d * (1 - d) * cb - (1 - e) * ca * cg + 2 * k * ca**2 * cb),
-            2
-            * (
-                d**2
-                - 1
-                + 2 * d**2 * cb**2
-                + 2 * (1 - k) * ca**2
-                - 4 * e * ca * cb * cg
-                + 2 * (1 - a2 / b2) * cg**2
-            ),
-            4 * (-d * (1 + d) * cb + 2 * a2 / b2 * cg**2 * cb - (1 - e) * ca * cg),
-            (1 + d) ** 2 - 4 * a2 / b2 * cg**2,
-        ],
-        axis=1,
-    )
-    v, real = _real_quartic_roots(coefficients)
-    with np.errstate(all="ignore"):
-        u = ((d - 1)[:, None] * v**2 - 2 * (d * cb)[:, None] * v + (1 + d)[:, None]) / (
-            2 * (cg[:, None] - v * ca[:, None])
+    n = len(bearings)
+    R, t = np.full((n, 4, 3, 3), np.nan), np.full((n, 4, 3), np.nan)
+    count = np.zeros(n, dtype=np.int64)
+    _solve_all(np.ascontiguousarray(bearings), np.ascontiguousarray(points_mm), R, t, count)
+    return R, t, np.arange(4) < count[:, None]
+
+
+@compiled
+def _solve_all(
+    bearings: FloatArray, points: FloatArray, R: FloatArray, t: FloatArray, count: IntArray
+) -> None:
+    four, distance, room = np.empty(4), np.empty((4, 3)), np.empty((3, 3, 3))
+    for i in range(len(bearings)):
+        f, p = bearings[i], points[i]
+        found = triangle_distances(
+            _gap2(p, 1, 2),
+            _gap2(p, 0, 2),
+            _gap2(p, 0, 1),
+            _dot(f, 1, 2),
+            _dot(f, 0, 2),
+            _dot(f, 0, 1),
+            four,
+            distance,
         )
-        s1 = np.sqrt(b2[:, None] / (1 + v**2 - 2 * v * cb[:, None]))
-        s2, s3 = u * s1, v * s1
-        valid = real & np.isfinite(s1) & (s1 > 0) & (s2 > 0) & (s3 > 0)
-        q1, q2, q3 = (s[..., None] * f[:, None] for s, f in ((s1, f1), (s2, f2), (s3, f3)))
-        R = _triad(q2 - q1, q3 - q1) @ np.swapaxes(_triad(p2 - p1, p3 - p1), -1, -2)[:, None]
-        middle = (p1 + p2 + p3) / 3
-        t = (q1 + q2 + q3) / 3 - np.einsum("nkij,nj->nki", R, middle)
-    area = np.linalg.norm(np.cross(p2 - p1, p3 - p1), axis=1)
-    valid &= (area > 0.05 * np.sqrt(b2 * c2))[:, None]
-    valid &= all_finite(R, 2) & all_finite(t)
-    return R, t, valid
+        n = 0
+        for m in range(found):
+            if pose_of_three(f, 0, 1, 2, p, 0, 1, 2, distance[m], R[i, n], t[i, n], room):
+                n += 1
+            else:
+                R[i, n], t[i, n] = np.nan, np.nan
+        count[i] = n
 
 
-def _triad(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return right-handed orthonormal frames, columns, with the first along x and the second in (x, y)."""
-    e1 = x / np.linalg.norm(x, axis=-1, keepdims=True)
-    e3 = np.cross(x, y)
-    e3 = e3 / np.linalg.norm(e3, axis=-1, keepdims=True)
-    return np.stack([e1, np.cross(e3, e1), e3], axis=-1)
+@compiled
+def triangle_distances(
+    a2: float, b2: float, c2: float, ca: float, cb: float, cg: float, four: FloatArray, out: FloatArray
+) -> int:
+    """Put the distances of a triangle's corners along three rays into ``out``, (4, 3), and return how many.
+
+    ``a2``, ``b2``, ``c2`` are the squared sides 2-3, 1-3 and 1-2, ``ca``, ``cb``, ``cg`` the cosines between
+    the rays of the same corners; ``four`` has room for four numbers.
+    """
+    d, e, k, a_b = (a2 - c2) / b2, (a2 + c2) / b2, c2 / b2, a2 / b2
+    x4 = (d - 1) ** 2 - 4 * k * ca**2
+    x3 = 4 * (d * (1 - d) * cb - (1 - e) * ca * cg + 2 * k * ca**2 * cb)
+    x2 = 2 * (
+        d**2 - 1 + 2 * d**2 * cb**2 + 2 * (1 - k) * ca**2 - 4 * e * ca * cb * cg + 2 * (1 - a_b) * cg**2
+    )
+    x1 = 4 * (-d * (1 + d) * cb + 2 * a_b * cg**2 * cb - (1 - e) * ca * cg)
+    x0 = (1 + d) ** 2 - 4 * a_b * cg**2
+    n = 0
+    for i in range(real_quartic_roots(x4, x3, x2, x1, x0, four)):
+        v = four[i]
+        u = ((d - 1) * v**2 - 2 * d * cb * v + 1 + d) / (2 * (cg - v * ca))
+        s1 = math.sqrt(b2 / (1 + v**2 - 2 * v * cb))
+        if s1 > 0 and u > 0 and v > 0 and math.isfinite(u * s1):
+            out[n, 0], out[n, 1], out[n, 2] = s1, u * s1, v * s1
+            n += 1
+    return n
 
 
-def _real_quartic_roots(coefficients: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the four roots' real parts, shape (n, 4), polished, and which are real."""
-    scale = np.abs(coefficients).max(axis=1, keepdims=True)
-    c = coefficients / np.where(scale > 0, scale, 1.0)
-    lead = np.where(np.abs(c[:, 0]) > 1e-10, c[:, 0], 1e-10)
-    companion = np.zeros((len(c), 4, 4))
-    companion[:, 0] = -c[:, 1:] / lead[:, None]
-    companion[:, 1, 0] = companion[:, 2, 1] = companion[:, 3, 2] = 1.0
-    roots = np.linalg.eigvals(companion) if len(c) else np.zeros((0, 4), dtype=complex)
-    # Noise turns a double root into a pair with a small imaginary part: keep its real part as a start.
-    real = np.abs(roots.imag) < 0.02 * np.abs(roots.real) + 1e-9
-    return np.ascontiguousarray(roots.real), real
+@compiled
+def pose_of_three(
+    f: FloatArray,
+    i: int,
+    j: int,
+    k: int,
+    p: FloatArray,
+    a: int,
+    b: int,
+    c: int,
+    distance: FloatArray,
+    R: FloatArray,
+    t: FloatArray,
+    room: FloatArray,
+) -> bool:
+    """Put the pose that brings points a, b, c onto rays i, j, k, at given distances, into ``R`` and ``t``.
+
+    False where the points are in line; ``room`` (3, 3, 3) is to work in.
+    """
+    for x in range(3):
+        room[0, 0, x], room[0, 1, x], room[0, 2, x] = (
+            distance[0] * f[i, x],
+            distance[1] * f[j, x],
+            distance[2] * f[k, x],
+        )
+    if not (_triad(p, a, b, c, room[1]) and _triad(room[0], 0, 1, 2, room[2])):
+        return False
+    for r in range(3):
+        total = room[0, 0, r] + room[0, 1, r] + room[0, 2, r]
+        for x in range(3):
+            R[r, x] = (
+                room[2, 0, r] * room[1, 0, x] + room[2, 1, r] * room[1, 1, x] + room[2, 2, r] * room[1, 2, x]
+            )
+            total -= R[r, x] * (p[a, x] + p[b, x] + p[c, x])
+        t[r] = total / 3
+    return True
+
+
+@compiled
+def _gap2(p: FloatArray, i: int, j: int) -> float:
+    return float((p[i, 0] - p[j, 0]) ** 2 + (p[i, 1] - p[j, 1]) ** 2 + (p[i, 2] - p[j, 2]) ** 2)
+
+
+@compiled
+def _dot(f: FloatArray, i: int, j: int) -> float:
+    return float(f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2])
+
+
+@compiled
+def _triad(p: FloatArray, i: int, j: int, k: int, out: FloatArray) -> bool:
+    """Put an orthonormal frame into ``out``, one axis a row: along a side, in the plane of three points.
+
+    False where they are in line.
+    """
+    x0, x1, x2 = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+    y0, y1, y2 = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
+    z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+    x, y = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2), math.sqrt(y0 * y0 + y1 * y1 + y2 * y2)
+    z = math.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
+    if not z > _SLIM * x * y:
+        return False
+    out[0, 0], out[0, 1], out[0, 2] = x0 / x, x1 / x, x2 / x
+    out[2, 0], out[2, 1], out[2, 2] = z0 / z, z1 / z, z2 / z
+    out[1, 0] = out[2, 1] * out[0, 2] - out[2, 2] * out[0, 1]
+    out[1, 1] = out[2, 2] * out[0, 0] - out[2, 0] * out[0, 2]
+    out[1, 2] = out[2, 0] * out[0, 1] - out[2, 1] * out[0, 0]
+    return True
+
+
+@compiled
+def real_quartic_roots(c4: float, c3: float, c2: float, c1: float, c0: float, out: FloatArray) -> int:
+    """Put the real roots of a quartic into ``out`` and return their number; nearly double ones count as real.
+
+    Ferrari's way: a root of the resolvent cubic splits the quartic into two quadratics; Newton's steps on the
+    quartic itself then give back the digits that were lost.
+    """
+    largest = max(abs(c4), abs(c3), abs(c2), abs(c1), abs(c0))
+    if not largest > 0:
+        return 0
+    c4 = c4 if abs(c4) > 1e-10 * largest else 1e-10 * largest
+    a, b, c, d = c3 / c4, c2 / c4, c1 / c4, c0 / c4
+    # x = y - a/4: y^4 + p y^2 + q y + r
+    p = b - 0.375 * a * a
+    q = c - 0.5 * a * b + 0.125 * a**3
+    r = d - 0.25 * a * c + a * a * b / 16 - 3 * a**4 / 256
+    # m > 0 with m^3 + p m^2 + (p^2/4 - r) m - q^2/8 = 0: its largest root.
+    m = _largest_cubic_root(p, 0.25 * p * p - r, -0.125 * q * q)
+    n = 0
+    if m > 1e-14 * (1 + abs(p)):
+        w = math.sqrt(2 * m)
+        shift = q / (2 * w)
+        n = _quadratic_roots(w, 0.5 * p + m - shift, a, out, n)
+        n = _quadratic_roots(-w, 0.5 * p + m + shift, a, out, n)
+    else:  # q = 0: a quadratic in y^2
+        root = math.sqrt(max(0.25 * p * p - r, 0.0))
+        for square in (-0.5 * p + root, -0.5 * p - root):
+            if square >= 0:
+                n = _quadratic_roots(0.0, -square, a, out, n)
+    for i in range(n):
+        x = out[i]
+        for _ in range(2):
+            value = (((x + a) * x + b) * x + c) * x + d
+            slope = ((4 * x + 3 * a) * x + 2 * b) * x + c
+            step = value / slope
+            if not abs(step) < 0.1 * (1 + abs(x)):
+                break
+            x -= step
+        out[i] = x
+    return n
+
+
+@compiled
+def _quadratic_roots(w: float, k: float, a: float, out: FloatArray, n: int) -> int:
+    """Append the roots of y^2 + w y + k, less a / 4, to the n in ``out``; a nearly double pair's too."""
+    square = 0.25 * w * w - k
+    middle = -0.5 * w - 0.25 * a
+    if square < 0:
+        if -square > (_DOUBLE_ROOT * middle) ** 2:
+            return n
+        square = 0.0
+    root = math.sqrt(square)
+    out[n], out[n + 1] = middle + root, middle - root
+    return n + 2
+
+
+@compiled
+def _largest_cubic_root(a: float, b: float, c: float) -> float:
+    """Return the largest real root of x^3 + a x^2 + b x + c."""
+    q, r = (a * a - 3 * b) / 9, (2 * a**3 - 9 * a * b + 27 * c) / 54
+    if r * r < q**3:
+        size = math.sqrt(q)
+        angle = math.acos(min(max(r / size**3, -1.0), 1.0))
+        x = -2 * size * math.cos((angle + 2 * math.pi) / 3) - a / 3
+        x = max(x, -2 * size * math.cos((angle - 2 * math.pi) / 3) - a / 3)
+    else:
+        u = -math.copysign((abs(r) + math.sqrt(max(r * r - q**3, 0.0))) ** (1 / 3), r)
+        x = u + (q / u if u != 0 else 0.0) - a / 3
+    for _ in range(2):
+        slope = (3 * x + 2 * a) * x + b
+        step = (((x + a) * x + b) * x + c) / slope
+        if not abs(step) < 0.1 * (1 + abs(x)):
+            break
+        x -= step
+    return x

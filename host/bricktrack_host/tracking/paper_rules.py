@@ -10,7 +10,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_host.tracking.segment import Blobs
 from bricktrack_host.tracking.verification import (
     Correspondence,
-    blob_pixels,
+    RunLights,
     no_correspondence,
     verified_correspondence,
     verify,
@@ -26,14 +26,19 @@ def identify_by_paper(
     hypotheses = paper_hypotheses(blobs, ray_model)
     if len(hypotheses) == 0:
         return no_correspondence(brick_model.n_leds, "no seven blobs obey the paper's rules")
-    kept, poses = verify(
-        blob_pixels(blobs, hypotheses), None, ray_model, brick_model, collar_mm=collar_mm, gate_px=gate_px
+    verified = verify(
+        RunLights.of([blobs]).of_leds(np.zeros(len(hypotheses), dtype=np.int64), hypotheses),
+        None,
+        ray_model,
+        brick_model,
+        collar_mm=collar_mm,
+        gate_px=gate_px,
     )
-    whole = np.flatnonzero(kept.all(axis=1))
+    whole = np.flatnonzero(verified.kept.all(axis=1))
     if len(whole) == 0:
         return no_correspondence(brick_model.n_leds, "reprojection refutes the paper's rules")
-    best = int(whole[np.argmin(poses.chi2[whole])])
-    return verified_correspondence(hypotheses[best], poses, best)
+    best = int(whole[np.argmax(verified.log_evidence[whole])])
+    return verified_correspondence(hypotheses[best], verified.poses, best)
 
 
 def is_paper_layout(brick_model: BrickModel) -> bool:

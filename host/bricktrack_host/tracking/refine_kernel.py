@@ -12,6 +12,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_host.compiled import compiled
 from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view
+from bricktrack_host.tracking.small_algebra import inverse_block, quadratic, rotation, solve
 
 N_UNKNOWNS = 19
 _PROFILE, _TWIST, _RATE = 6, 7, 13
@@ -152,9 +153,9 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
         for _ in range(max_steps if round_ == 0 else 3):
             if not math.isfinite(cost) or damping > 1e6:
                 break
-            if not _solve(room.A, room.g, damping, n, room.L, room.step):
+            if not solve(room.A, room.g, damping, n, room.L, room.step):
                 break
-            if _quadratic(room.A, room.step, n) < _DONE_SIGMAS**2:
+            if quadratic(room.A, room.step, n) < _DONE_SIGMAS**2:
                 break
             size = math.sqrt(room.step[0] ** 2 + room.step[1] ** 2 + room.step[2] ** 2)
             for c in range(n):
@@ -180,10 +181,10 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
     if rejected:  # residuals and the like are of the last pose tried: have those of the pose taken
         cost = _normal_equations(i, observed, model, fitted, R, t, more, room, room.A, room.g)
     fitted.cost[i] = cost
-    if not math.isfinite(cost) or not _solve(room.A, room.g, 0.0, n, room.L, room.step):
+    if not math.isfinite(cost) or not solve(room.A, room.g, 0.0, n, room.L, room.step):
         fitted.cost[i] = np.nan
         return
-    _covariance(room.L, n, fitted.covariance[i], room.step)
+    inverse_block(room.L, n, fitted.covariance[i], room.step)
 
 
 @compiled
@@ -383,25 +384,6 @@ def _pose_row(
 
 
 @compiled
-def rotation(x: float, y: float, z: float, out: FloatArray) -> None:
-    """Put the matrix of a rotation vector into ``out`` (Rodrigues' formula)."""
-    angle2 = x * x + y * y + z * z
-    angle = math.sqrt(angle2)
-    if angle < 1e-4:
-        a, b = 1 - angle2 / 6, 0.5 - angle2 / 24
-    else:
-        a, b = math.sin(angle) / angle, (1 - math.cos(angle)) / angle2
-    out[0, 0], out[1, 1], out[2, 2] = (
-        1 - b * (y * y + z * z),
-        1 - b * (x * x + z * z),
-        1 - b * (x * x + y * y),
-    )
-    out[0, 1], out[1, 0] = b * x * y - a * z, b * x * y + a * z
-    out[0, 2], out[2, 0] = b * x * z + a * y, b * x * z - a * y
-    out[1, 2], out[2, 1] = b * y * z - a * x, b * y * z + a * x
-
-
-@compiled
 def _copy(
     R: FloatArray, t: FloatArray, more: FloatArray, R_to: FloatArray, t_to: FloatArray, more_to: FloatArray
 ) -> None:
@@ -433,62 +415,3 @@ def _went_far(R: FloatArray, t: FloatArray, R_old: FloatArray, t_old: FloatArray
         for c in range(3):
             turned += (R[r, c] - R_old[r, c]) ** 2
     return moved > _FRESH_MM**2 or turned > _FRESH_RAD**2
-
-
-@compiled
-def _solve(A: FloatArray, g: FloatArray, damping: float, n: int, L: FloatArray, x: FloatArray) -> bool:
-    """Solve (A + damping diag(A)) x = g by Cholesky, L is left; false if A is singular to precision."""
-    for c in range(n, len(x)):
-        x[c] = 0.0
-    for c in range(n):
-        for b in range(c + 1):
-            total = A[c, b]
-            if b == c:
-                total += damping * A[c, c]
-            for k in range(b):
-                total -= L[c, k] * L[b, k]
-            if b == c:
-                if not total > 1e-14 * A[c, c]:
-                    return False
-                L[c, c] = math.sqrt(total)
-            else:
-                L[c, b] = total / L[b, b]
-    for c in range(n):
-        total = g[c]
-        for k in range(c):
-            total -= L[c, k] * x[k]
-        x[c] = total / L[c, c]
-    for c in range(n - 1, -1, -1):
-        total = x[c]
-        for k in range(c + 1, n):
-            total -= L[k, c] * x[k]
-        x[c] = total / L[c, c]
-    return True
-
-
-@compiled
-def _quadratic(A: FloatArray, x: FloatArray, n: int) -> float:
-    total = 0.0
-    for c in range(n):
-        total += A[c, c] * x[c] * x[c]
-        for b in range(c):
-            total += 2 * A[c, b] * x[c] * x[b]
-    return total
-
-
-@compiled
-def _covariance(L: FloatArray, n: int, out: FloatArray, column: FloatArray) -> None:
-    """Put the pose's block of the inverse of L L' into ``out``, shape (6, 6)."""
-    for j in range(6):
-        for c in range(n):
-            total = 1.0 if c == j else 0.0
-            for k in range(j, c):
-                total -= L[c, k] * column[k]
-            column[c] = total / L[c, c] if c >= j else 0.0
-        for c in range(n - 1, -1, -1):
-            total = column[c]
-            for k in range(c + 1, n):
-                total -= L[k, c] * column[k]
-            column[c] = total / L[c, c]
-        for c in range(6):
-            out[c, j] = column[c]

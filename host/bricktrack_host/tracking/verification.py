@@ -4,6 +4,7 @@
 equally well, that is the answer; none is chosen.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,9 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
+from bricktrack_host.tracking.evidence import Evidence, evidence_of
 from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.led_profile import shift_per_radius
 from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
 from bricktrack_host.tracking.segment import Blobs
@@ -19,6 +22,11 @@ from bricktrack_host.tracking.segment import Blobs
 MIN_INLIERS = 4
 MIN_FACING = 0.05
 """Cosine between an LED's axis and the line of sight below which it is not believed to be seen."""
+_MAX_BAD, _MAX_INTRUDERS = 3, 2
+_SURE = 7.0  # log likelihood that an LED of an assignment that scatters must add to be believed: 1000 to one
+_HOPELESS = 25.0  # log likelihood below the best of the picture: an intruder left out does not make up for it
+_CUT_SD_GATES = 0.9
+"""Trust in a cut light, over the gate: what is left has its centroid elsewhere, up to a radius."""
 _IDENTITY_SD_PX = 1.5
 """Trust in a blob while identities are decided: far above centroid noise, so that rolling shutter and an
 unfitted profile do not refuse a true assignment, far below the distance between two LEDs."""
@@ -80,69 +88,212 @@ def verified_correspondence(blob_of_led: IntArray, poses: RefinedPoses, i: int) 
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LedLights:
+    """The lights that assignments give to LEDs; NaN for none.
+
+    Attributes
+    ----------
+    uv_px : ndarray, shape (n, n_leds, 2), px
+    cov_px2 : ndarray, shape (n, n_leds, 2, 2), px^2
+    area_px2 : ndarray, shape (n, n_leds), px^2
+    is_whole : ndarray of bool, shape (n, n_leds)
+        False where the border or a card cuts a light, or it is two.
+    """
+
+    uv_px: FloatArray
+    cov_px2: FloatArray
+    area_px2: FloatArray
+    is_whole: BoolArray
+
+    def take(self, rows: IntArray) -> "LedLights":
+        """Return some of the assignments."""
+        return LedLights(self.uv_px[rows], self.cov_px2[rows], self.area_px2[rows], self.is_whole[rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunLights:
+    """The lights of many pictures, one after the other.
+
+    Attributes
+    ----------
+    first : ndarray of int64, shape (n_pictures + 1,)
+        Where each picture's begin.
+    uv_px, cov_px2, area_px2, flags : ndarray, shapes (n, 2), (n, 2, 2), (n,) and (n,)
+        See `segment.Blobs`.
+    """
+
+    first: IntArray
+    uv_px: FloatArray
+    cov_px2: FloatArray
+    area_px2: FloatArray
+    flags: IntArray
+
+    @staticmethod
+    def of(pictures: Sequence[Blobs | None]) -> "RunLights":
+        """Put the lights of pictures together; `None` has none."""
+        given = [b for b in pictures if b is not None]
+        count = [0 if b is None else len(b) for b in pictures]
+        return RunLights(
+            first=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
+            uv_px=np.concatenate([np.empty((0, 2)), *(b.uv_px for b in given)]),
+            cov_px2=np.concatenate([np.empty((0, 2, 2)), *(b.cov_px2 for b in given)]),
+            area_px2=np.concatenate([np.empty(0), *(b.area_px2 for b in given)]),
+            flags=np.concatenate([np.empty(0, dtype=np.int64), *(b.flags for b in given)]),
+        )
+
+    @property
+    def count(self) -> IntArray:
+        """Number of lights of each picture."""
+        return np.diff(self.first)
+
+    def of_leds(self, pictures: IntArray, blob_of_led: IntArray) -> LedLights:
+        """Take the lights of assignments (n, n_leds), numbered within each one's picture; -1 for none."""
+        given = blob_of_led >= 0
+        index = np.where(given, self.first[pictures][:, None] + blob_of_led, 0)
+        uv, cov, area = (self._taken(x, index, given) for x in (self.uv_px, self.cov_px2, self.area_px2))
+        return LedLights(
+            uv, cov, area, given & (self._taken(self.flags.astype(np.float64), index, given) == 0)
+        )
+
+    @staticmethod
+    def _taken(values: FloatArray, index: IntArray, given: BoolArray) -> FloatArray:
+        out = np.full((*index.shape, *values.shape[1:]), np.nan)
+        out[given] = values[index[given]]
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verified:
+    """What `verify` found.
+
+    Attributes
+    ----------
+    kept : ndarray of bool, shape (n, n_leds)
+        LEDs that are explained; all false where fewer than four.
+    poses : RefinedPoses
+    log_evidence : ndarray, shape (n,)
+        See `evidence`.
+    """
+
+    kept: BoolArray
+    poses: RefinedPoses
+    log_evidence: FloatArray
+
+    def take(self, rows: IntArray) -> "Verified":
+        """Return some of the assignments."""
+        return Verified(self.kept[rows], self.poses.take(rows), self.log_evidence[rows])
+
+    def replaced(self, rows: IntArray, by: "Verified") -> "Verified":
+        """Return these with some replaced."""
+        kept, log_evidence = self.kept.copy(), self.log_evidence.copy()
+        kept[rows], log_evidence[rows] = by.kept, by.log_evidence
+        return Verified(kept, self.poses.replaced(rows, by.poses), log_evidence)
+
+
 def verify(
-    uv_px: FloatArray,
+    lights: LedLights,
     starts: tuple[FloatArray, FloatArray] | None,
     ray_model: RayModel,
     brick_model: BrickModel,
     *,
     collar_mm: float | None,
-    gate_px: float,
-) -> tuple[BoolArray, RefinedPoses]:
+    gate_px: FloatArray | float,
+    picture: IntArray | None = None,
+) -> Verified:
     """Fit poses to assignments and keep the LEDs that each pose explains.
 
     Parameters
     ----------
-    uv_px : ndarray, shape (n, n_leds, 2), px
-        The blob of each LED under each hypothesis; NaN for none.
+    lights : LedLights
+        Of each LED under each of n assignments.
     starts : (R, t) or None
         Shapes (n, 3, 3) and (n, 3); `None`: by PRSOI.
-    gate_px : float
+    gate_px : float or ndarray, shape (n,)
         Largest residual that is believed.
+    picture : ndarray of int64, shape (n,), optional
+        Assignments of one picture compete: the hopeless are not looked at further. Default: each has its own.
 
-    Returns
-    -------
-    kept : ndarray of bool, shape (n, n_leds)
-        All false where fewer than four LEDs remain.
-    poses : RefinedPoses
+    Notes
+    -----
+    LEDs beyond the gate, or that the pose hides, are left out one at a time, the worst: a false light drags
+    its neighbours' residuals with it. Where residuals scatter more than centroids do, a false light may be
+    among them: the assignment is tried without each of its LEDs, and the likeliest of these is taken unless
+    the LED that it lacks is a thousand times likelier to be one.
     """
-    uv = uv_px.copy()
+    uv = lights.uv_px.copy()
     n = len(uv)
     R, t = starts if starts is not None else prsoi_starts(uv, ray_model, brick_model)
-    cov = np.broadcast_to(_IDENTITY_SD_PX**2 * np.eye(2), (n, brick_model.n_leds, 2, 2))
-    poses = refine_poses(uv, cov, R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=6)
-    for last in (False, False, True):
-        length = np.linalg.norm(poses.residual_px, axis=-1)
-        seen = all_finite(uv)
-        bad = seen & ~((length <= gate_px) & (poses.facing > MIN_FACING))
+    gate = np.broadcast_to(np.asarray(gate_px, dtype=np.float64), n)
+    picture = np.arange(n) if picture is None else picture
+    mode = ray_model.sensor_mode
+    variance = np.where(lights.is_whole, _IDENTITY_SD_PX**2, (_CUT_SD_GATES * gate[:, None]) ** 2)
+    cov = variance[..., None, None] * np.eye(2)
+    shift_sd = None if collar_mm is None else shift_per_radius(collar_mm, brick_model)
+
+    def fit(rows: IntArray, uv: FloatArray, R: FloatArray, t: FloatArray) -> tuple[RefinedPoses, Evidence]:
+        poses = refine_poses(uv, cov[rows], R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=6)
+        some = lights.take(rows)
+        return poses, evidence_of(
+            poses.residual_px,
+            some.cov_px2,
+            some.is_whole,
+            all_finite(uv),
+            some.area_px2,
+            poses.area_px2,
+            poses.facing,
+            shift_sd_per_radius=shift_sd,
+            n_pixels=mode.width * mode.height,
+            min_leds=MIN_INLIERS,
+        )
+
+    def start(rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        known = all_finite(poses.R_camera_brick[rows], 2)
+        return (
+            np.where(known[:, None, None], poses.R_camera_brick[rows], R[rows]),
+            np.where(known[:, None], poses.t_camera_brick_mm[rows], t[rows]),
+        )
+
+    poses, evidence = fit(np.arange(n), uv, R, t)
+    for _ in range(_MAX_BAD):
+        length, bad = _beyond(uv, poses, gate)
         rows = np.flatnonzero(bad.any(axis=1))
         if rows.size == 0:
             break
-        if last:
-            uv[rows] = np.nan
+        uv[rows, np.where(bad[rows], length[rows], -1.0).argmax(axis=1)] = np.nan
+        again, new = fit(rows, uv[rows], *start(rows))
+        poses, evidence = poses.replaced(rows, again), evidence.replaced(rows, new)
+    for _ in range(_MAX_INTRUDERS):
+        best = np.full(int(picture.max(initial=0)) + 1, -np.inf)
+        np.maximum.at(best, picture, evidence.log_ratio)
+        hopeful = evidence.log_ratio > best[picture] - _HOPELESS
+        rows = np.flatnonzero(hopeful & evidence.is_scattered & (all_finite(uv).sum(axis=1) > MIN_INLIERS))
+        row, led = np.nonzero(all_finite(uv[rows]))
+        if row.size == 0:
             break
-        # One at a time, the worst: a false blob drags its neighbours' residuals with it.
-        worst = np.where(bad[rows], np.nan_to_num(length[rows], nan=np.inf), -1.0)
-        uv[rows, worst.argmax(axis=1)] = np.nan
-        again = refine_poses(
-            uv[rows],
-            cov[rows],
-            np.where(np.isfinite(poses.R_camera_brick[rows]), poses.R_camera_brick[rows], R[rows]),
-            np.where(np.isfinite(poses.t_camera_brick_mm[rows]), poses.t_camera_brick_mm[rows], t[rows]),
-            ray_model,
-            brick_model,
-            collar_mm=collar_mm,
-            max_steps=6,
-        )
-        poses = poses.replaced(rows, again)
-    kept = all_finite(uv)
+        tried = uv[rows[row]]
+        tried[np.arange(len(row)), led] = np.nan
+        without, new = fit(rows[row], tried, *start(rows[row]))
+        gain = new.log_ratio - evidence.log_ratio[rows[row]]
+        order = np.lexsort((-gain, row))
+        top = order[np.unique(row[order], return_index=True)[1]]  # the likeliest of each row
+        top = top[gain[top] > -_SURE]
+        if top.size == 0:
+            break
+        at = rows[row[top]]
+        uv[at] = tried[top]
+        poses, evidence = poses.replaced(at, without.take(top)), evidence.replaced(at, new.take(top))
+    _, bad = _beyond(uv, poses, gate)
+    kept = np.asarray(all_finite(uv) & ~bad.any(axis=1, keepdims=True))
     kept[kept.sum(axis=1) < MIN_INLIERS] = False
-    return kept, poses
+    return Verified(kept, poses, np.where(kept.any(axis=1), evidence.log_ratio, -np.inf))
 
 
-def blob_pixels(blobs: Blobs, blob_of_led: IntArray) -> FloatArray:
-    """Return the blobs' centroids in the order of the LEDs, shape (..., n_leds, 2), NaN for none."""
-    return np.where((blob_of_led >= 0)[..., None], blobs.uv_px[np.maximum(blob_of_led, 0)], np.nan)
+def _beyond(uv: FloatArray, poses: RefinedPoses, gate: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the residuals' lengths, and which LEDs are beyond the gate or cannot be seen, (n, n_leds)."""
+    seen = all_finite(uv)
+    length = np.where(seen, np.nan_to_num(np.linalg.norm(poses.residual_px, axis=-1), nan=np.inf), 0.0)
+    return length, seen & ~((length <= gate[:, None]) & (poses.facing > MIN_FACING))
 
 
 def identity_gate_px(radius_px: float) -> float:

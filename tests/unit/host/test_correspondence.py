@@ -6,8 +6,9 @@ from led_scenes import leds_in_camera, random_poses, seven_leds
 from pinhole import PinholeCamera
 
 from bricktrack_common.brick_model import LayoutFile, LedEntry, brick_model_from_file
-from bricktrack_host.tracking.correspondence import assign_predicted, search_correspondence
+from bricktrack_host.tracking.correspondence import search_correspondence
 from bricktrack_host.tracking.paper_rules import identify_by_paper, is_paper_layout, paper_correspondence
+from bricktrack_host.tracking.pattern import assign_predicted
 from bricktrack_host.tracking.segment import Blobs
 
 CAMERA = PinholeCamera()
