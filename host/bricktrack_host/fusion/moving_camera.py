@@ -15,13 +15,13 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import ConfigError
-from bricktrack_host.fusion.imu_signal import ImuSignal, chain_rotations, seconds_since, usable_samples
+from bricktrack_host.fusion.attitude import Attitude, mean_rate
+from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.joint_alignment import align_jointly
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
-_NODE_S = 0.0025  # of the integrated gyro: coning over it is below 1e-8 rad
-_ALIGN_ROUNDS = 6
-_ALIGNED_NS = 2e4  # offsets that moved less are settled: 6 um at 0.3 m/s
+_ALIGN_ROUNDS = 3
 NOT_OBSERVABLE = (
     "When the camera moves, one IMU on the LED component cannot tell the camera's acceleration from the "
     "brick's: the position is not observable. Mount a second IMU with the camera, or smooth the optical "
@@ -46,33 +46,6 @@ class CameraImu:
     imu: ImuTrack
     imu_to_camera_mm: FloatArray
     kind: Literal["imu", "table"] = "imu"
-
-
-class Attitude:
-    """The attitude of a body by its gyro, in axes that stand still, from the first sample on."""
-
-    def __init__(self, signal: ImuSignal, bias_radps: FloatArray) -> None:
-        self._signal, self._bias = signal, bias_radps
-        n = int(np.ceil((signal.t_s[-1] - signal.t_s[0]) / _NODE_S))
-        self._nodes = np.linspace(signal.t_s[0], signal.t_s[-1], n + 1)
-        steps = self._turn(self._nodes[:-1], self._nodes[1:])
-        self._R = np.concatenate([np.eye(3)[None], chain_rotations(steps)])
-
-    def _turn(self, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        return self._signal.increments(
-            start_s, end_s, gyro_bias_radps=self._bias, acc_bias_mps2=np.zeros(3), acc_lag_s=0.0
-        ).R
-
-    def at(self, t_s: FloatArray) -> FloatArray:
-        """Return the attitudes at instants, shape (n, 3, 3); held beyond the samples."""
-        t = np.clip(t_s, self._nodes[0], self._nodes[-1])
-        i = np.clip(np.searchsorted(self._nodes, t) - 1, 0, len(self._nodes) - 2)
-        return np.asarray(self._R[i] @ self._turn(self._nodes[i], t))
-
-
-def mean_rate(imu: ImuTrack) -> FloatArray:
-    """Return the gyro's mean, rad/s: its bias, as a body that ends as it began shows it."""
-    return np.asarray(imu.gyro_radps[usable_samples(imu)].mean(axis=0), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,26 +177,24 @@ def align_both(
     """Return how camera time maps to the time of both sensors, from the rotations that all saw.
 
     The camera sees the rotation of B in A. With that of A taken out by its gyro, what is left is the brick's
-    own, and aligned with its gyro; and the other way round, until both offsets stand. Each sensor's own
-    sample clock is found with it. Where the rotation of A tells nothing (a table that only shifts) its
-    offset stays that of the stamps.
+    own, and aligned with its gyro; and the other way round. From there both are found together, see
+    `joint_alignment`. Each sensor's own sample clock is found with it. Where the rotation of A tells nothing
+    (a table that only shifts) its offset stays that of the stamps.
     """
     a: TimeAlignment | None = None
     b: TimeAlignment | None = None
-    for _ in range(_ALIGN_ROUNDS):
-        before = b
+    for _ in range(1 if camera.kind == "table" else _ALIGN_ROUNDS):
         b = align_times(
             _without(optical, camera.imu, a, is_camera=True), imu,
             max_offset_s=max_offset_s, prior_sd_ns=prior_sd_ns,
         )  # fmt: skip
-        if camera.kind == "table":
-            break
-        a = align_times(
-            _without(optical, imu, b, is_camera=False), camera.imu,
-            max_offset_s=max_offset_s, prior_sd_ns=prior_sd_ns,
-        )  # fmt: skip
-        if before is not None and abs(b.offset_ns - before.offset_ns) < _ALIGNED_NS:
-            break
+        if camera.kind == "imu":
+            a = align_times(
+                _without(optical, imu, b, is_camera=False), camera.imu,
+                max_offset_s=max_offset_s, prior_sd_ns=prior_sd_ns,
+            )  # fmt: skip
+            if a.source == b.source == "data":
+                b, a = align_jointly(optical, imu, b, camera.imu, a, camera_bias_radps=mean_rate(camera.imu))
     if b is None:
         raise ConfigError("no round of alignment was made")
     if a is None:
@@ -241,12 +212,12 @@ def _without(
     camera.
     """
     if alignment is None:
-        restamped, t_ns = imu, optical.t_ns
+        restamped, t_ns, filter_s = imu, optical.t_ns, 0.0
     else:
         clock = alignment.sample_clock
         restamped = imu if clock is None else clock.restamp(imu)
-        t_ns = alignment.imu_time_ns(optical.t_ns)
-    signal = ImuSignal.from_track(restamped)
+        t_ns, filter_s = alignment.imu_time_ns(optical.t_ns), alignment.gyro_filter_s
+    signal = ImuSignal.from_track(restamped, gyro_filter_s=filter_s)
     R = Attitude(signal, mean_rate(imu)).at(seconds_since(t_ns, signal.epoch_ns))
     seen = optical.R_camera_brick if is_camera else np.swapaxes(optical.R_camera_brick, 1, 2)
     return replace(optical, R_camera_brick=R @ seen)

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from two_imus import IMU_TO_CAMERA_MM, simulate_two_imus
 
 from bricktrack_common.errors import ConfigError
+from bricktrack_host.fusion.attitude import mean_rate
 from bricktrack_host.fusion.estimate import fuse
-from bricktrack_host.fusion.moving_camera import CameraImu, mean_rate
+from bricktrack_host.fusion.moving_camera import CameraImu
 
 DROPOUTS = ((2.0, 2.4), (3.6, 3.9))
 

@@ -1,0 +1,122 @@
+"""From a recording (simulated) whose camera is shaken and rocked to its fused motion, by the command line."""
+
+import numpy as np
+import pytest
+from shaken_pair import make_shaken_pair
+from typer.testing import CliRunner
+
+from bricktrack_common.errors import ConfigError, RunFormatError
+from bricktrack_common.run_folder import read_run
+from bricktrack_host.cli.main import app
+from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.results.daq_clock import fit_edges
+from bricktrack_host.results.result_store import read_result
+from bricktrack_host.results.true_motion import read_true_motion
+from bricktrack_host.stages.camera_sensor import CameraSensor, choose_camera_sensor, read_camera_sensor
+from bricktrack_host.transfer.fleet_config import load_fleet
+
+pytestmark = pytest.mark.slow
+
+_UNIT = '[[unit]]\nname = "b7-2"\ncalibration = "calibration.json"\nlayout = "kit/layout.toml"\n'
+_OTHER = '[[unit]]\nname = "b7-1"\n'
+_IMU = "[unit.camera_imu]\nto_camera_mm = [-18.0, 25.0, 7.0]\n"
+_FLEETS = {
+    "own": f'{_UNIT}camera = "imu"\n{_IMU}imu = "camera"\n{_OTHER}',
+    "other": f'{_UNIT}camera = "imu"\n{_IMU}imu = "brick"\nunit = "b7-1"\n{_OTHER}',
+    "none": f'{_UNIT}camera = "imu"\n{_OTHER}',
+    "table": f'{_UNIT}camera = "table"\n[unit.camera_table]\ncolumns = ["AX", "AY", "AZ"]\n'
+    f'measured_in = "g"\n{_OTHER}',
+}
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    pair = make_shaken_pair(tmp_path_factory.mktemp("pair"), shake_s=2.5)
+    for name, text in _FLEETS.items():
+        (pair.folder / f"{name}.toml").write_text(text)
+    return pair
+
+
+def unit_of(pair, fleet):
+    return load_fleet(pair.folder / f"{fleet}.toml").unit[0]
+
+
+def sensor(pair, fleet, **options):
+    return choose_camera_sensor(pair.run, unit_of(pair, fleet), **options)
+
+
+def samples(pair, chosen, problems=None):
+    run = read_run(pair.run)
+    return read_camera_sensor(
+        run, chosen, fit_edges(run.edges_ns, 200.0), [] if problems is None else problems
+    )
+
+
+def process(pair, fleet, *options):
+    output = pair.folder / f"results-{fleet}"
+    arguments = ["process", str(pair.run), "--fleet", str(pair.folder / f"{fleet}.toml"), "-o", str(output)]
+    done = CliRunner().invoke(app, [*arguments, *options], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return read_result(output), done.output
+
+
+def rms_mm(pair, track):
+    _, t_mm = read_true_motion(pair.truth).at(track.t_ns)
+    off = np.linalg.norm(track.t_camera_brick_mm - t_mm, axis=1)
+    inside = track.flags & (PoseFlag.DROPOUT | PoseFlag.EXTRAPOLATED)
+    return tuple(
+        float(np.sqrt(np.nanmean(off[where] ** 2))) for where in (inside == 0, inside == PoseFlag.DROPOUT)
+    )
+
+
+def test_with_an_imu_beside_the_camera_the_motion_is_fused_and_without_it_is_not(pair):
+    fused, said = process(pair, "own")
+    assert not fused.fused["edge"].flags[0] & PoseFlag.OPTICAL_ONLY
+    assert fused.alignment["camera_sensor"] == "imu"
+    assert fused.provenance.settings["camera_sensor_imu"] == "camera"
+    alone, words = process(pair, "none")
+    assert NOT_OBSERVABLE in words.replace("\n", " ") and "not observable" not in said
+    assert (alone.fused["edge"].flags & PoseFlag.OPTICAL_ONLY != 0).all()
+    outside, inside = rms_mm(pair, fused.fused["edge"])
+    # The camera's own motion moves the brick by some 3 mm in a dropout of 0.3 s, were it not known.
+    assert outside < 0.06
+    assert inside < 0.4
+    assert inside < 0.2 * rms_mm(pair, alone.fused["edge"])[1]
+
+
+def test_the_sensor_of_another_unit_comes_by_the_edges_that_both_saw(pair):
+    own = samples(pair, sensor(pair, "own"))
+    other = samples(pair, sensor(pair, "other"))
+    # The jitter of 600 edges leaves far less than a microsecond; the stamps are rounded to one.
+    assert np.abs(other.imu.t_ns - own.imu.t_ns).max() < 2000
+    np.testing.assert_array_equal(other.imu.acc_mps2, own.imu.acc_mps2)
+
+
+def test_the_tables_samples_come_by_their_number(pair):
+    chosen = sensor(pair, "table", table=pair.table, sample_column="Sample", first_sample=1)
+    found = samples(pair, chosen)
+    edges = read_run(pair.run).edges_ns
+    assert np.abs(found.imu.t_ns - edges).max() < 2000
+    assert found.kind == "table" and not found.imu.gyro_radps.any()
+    rms = np.sqrt(np.mean(found.imu.acc_mps2**2, axis=0)) / 9.80665
+    assert (rms > 0.15).all() and (rms < 0.45).all()  # 0.3 g over the shake, and rest around it
+
+
+def test_what_is_missing_is_named_with_its_remedy(pair, tmp_path):
+    with pytest.raises(ConfigError, match="no IMU 'lid'.*has: brick, camera"):
+        samples(pair, CameraSensor(kind="imu", imu="lid", rotation=((1, 0, 0), (0, 1, 0), (0, 0, 1))))
+    with pytest.raises(ConfigError, match="does not move with the table"):
+        sensor(pair, "own", table=pair.table)
+    with pytest.raises(ConfigError, match="--fleet|fleet file"):
+        sensor(pair, "own", camera_run=pair.other_run)
+    with pytest.raises(ConfigError, match="not a run of unit 'b7-1'"):
+        sensor(pair, "other", camera_run=pair.run)
+    wrong = tmp_path / "table.csv"
+    wrong.write_text("Sample,AX,AY,AW\n" + "".join(f"{i},0,0,0\n" for i in range(100)))
+    with pytest.raises(RunFormatError, match="no column AZ; there are sample, AX, AY, AW"):
+        samples(pair, sensor(pair, "table", table=wrong, sample_column="Sample"))
+    problems = []
+    chosen = sensor(pair, "table", table=pair.table)
+    assert read_camera_sensor(read_run(pair.run), chosen, None, problems) is None
+    assert "no time here" in problems[0]
