@@ -21,7 +21,7 @@ from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_identity import Identities, SegmentMethod, identify_run
-from bricktrack_host.tracking.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.led_profile import LedPrediction, collar_of, predict_brick
 from bricktrack_host.tracking.look_ahead import look_ahead
 from bricktrack_host.tracking.segment import Blobs, PaperLimits, Picture, find_blobs, paper_filter
 from bricktrack_host.tracking.verification import MIN_INLIERS
@@ -31,6 +31,9 @@ logger = logging.getLogger(__name__)
 
 _AREA_SIGMAS = 6.0
 _AREA_FLOOR = 0.015  # a dome behind an edge that hides this share of it moves its centroid by some 0.7 px
+_AREA_PER_MISFIT = 6.0
+"""Rolling shutter is not yet taken off: a pose whose LEDs lie off by a share of their distance has the scale
+wrong by as much, areas by twice that; and three times that is believed."""
 _BLUR_COV_SHARE = 0.03
 """Error of mid-exposure, as a share of the length of the smear: the motion is not uniform during exposure."""
 NOT_USED = LedFlag.MISSING | LedFlag.BORDER | LedFlag.PARTLY_COVERED | LedFlag.MERGED
@@ -198,12 +201,27 @@ def _flag_areas(
     usual = np.where(strange, usual_of_all, usual)
     deviation = ratio - usual
     spread = 1.4826 * np.median(np.abs(deviation[usable])) if usable.any() else 0.0
-    limit = max(_AREA_SIGMAS * spread, _AREA_FLOOR)
+    limit = np.maximum(
+        max(_AREA_SIGMAS * spread, _AREA_FLOOR),
+        _AREA_PER_MISFIT * _relative_misfit(out.uv_px[posed], prediction),
+    )[:, None]
     flags = out.led_flags[posed]
     with np.errstate(invalid="ignore"):
         flags[deviation < -limit] |= LedFlag.PARTLY_COVERED
         flags[deviation > 2 * limit] |= LedFlag.MERGED
     out.led_flags[posed] = flags
+
+
+def _relative_misfit(uv_px: FloatArray, prediction: LedPrediction) -> FloatArray:
+    """Return how far lights lie from where their pose has them over how far they lie apart, (n,); rms."""
+    off = np.sum((uv_px - prediction.uv_px) ** 2, axis=-1)
+    n_seen = np.maximum(np.isfinite(off).sum(axis=1), 1)
+    seen = np.where(np.isfinite(off)[..., None], uv_px, 0.0)
+    from_middle = np.where(
+        np.isfinite(off)[..., None], uv_px - (seen.sum(axis=1) / n_seen[:, None])[:, None], 0.0
+    )
+    apart = np.sum(from_middle**2, axis=(1, 2))
+    return np.asarray(np.sqrt(np.nansum(off, axis=1) / np.maximum(apart, 1.0)))
 
 
 def _median_or_nan(values: FloatArray, usable: BoolArray) -> FloatArray:

@@ -50,7 +50,7 @@ def window_levels(
         return nan, nan
     n_up_to, light_up_to = np.cumsum(count), np.cumsum(count * linear)
     n, light = n_up_to[255], light_up_to[255]
-    threshold = 0.5 * (linear[lowest] + linear[highest])
+    threshold = light / n  # a glint beside the LED may be far brighter, but is small
     n_below = 0.0
     for _ in range(20):
         i = np.searchsorted(linear, threshold, side="right") - 1

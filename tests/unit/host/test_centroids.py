@@ -47,6 +47,14 @@ def test_a_saturated_light_is_measured_by_its_rim():
     np.testing.assert_allclose(spot.uv_px, [60.4, 57.1], atol=2 * QUANTISED_PX)
 
 
+def test_a_dim_led_is_not_lost_beside_a_brighter_glint():
+    light = window(centre=(60.4, 57.1), level=0.35, background=0.04)
+    draw_disc(light, (108.0, 80.0), (5.0, 5.0), level=1.0)
+    spot = measure_spot(luma_of_light(light), origin_px=(0, 0))
+    np.testing.assert_allclose(spot.uv_px, [60.4, 57.1], atol=2 * QUANTISED_PX)
+    assert spot.area_px2 == pytest.approx(np.pi * 30**2, rel=5e-3)
+
+
 def test_the_covariance_is_no_smaller_than_the_scatter_under_noise():
     rng = np.random.default_rng(3)
     codes = luma_of_light(window(centre=(60.4, 57.1), level=0.8)).astype(float)
