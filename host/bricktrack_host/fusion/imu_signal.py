@@ -336,7 +336,7 @@ class ImuSignal:
             f_curve_mps4=np.empty((n, 3)),
         )
         integrate_steps(
-            self._pieces(),
+            self.pieces(),
             np.ascontiguousarray(start_s),
             np.ascontiguousarray(end_s),
             np.ascontiguousarray(np.broadcast_to(gyro_bias_radps, (n, 3))),
@@ -346,7 +346,8 @@ class ImuSignal:
         )  # fmt: skip
         return out
 
-    def _pieces(self) -> SignalPieces:
+    def pieces(self) -> SignalPieces:
+        """Return the splines for compiled loops."""
         return SignalPieces(
             knots_s=self._gyro.x,
             span_s=(float(self.t_s[0]), float(self.t_s[-1])),

@@ -9,8 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
-from bricktrack_host.fusion.imu_signal import ImuSignal, chain_rotations
+from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.fusion.imu_signal import ImuSignal
+from bricktrack_host.fusion.rotation_fit_kernel import (
+    compare_with_gyro,
+    drift_of,
+    integrated_attitudes,
+    normal_equations,
+)
 
 MIN_POSES = 20
 GRID_S = 0.004  # of the cross-correlation
@@ -123,37 +129,31 @@ class RotationFit:
         self._skew_prior_sd = skew_prior_sd
         n = int(np.ceil((signal.t_s[-1] - signal.t_s[0]) / _NODE_S))
         self._nodes = np.linspace(signal.t_s[0], signal.t_s[-1], n + 1)
+        self._pieces = signal.pieces()
         self._remove_bias(np.zeros(3))
+        self._unbiased = self._attitude  # every solution begins with it
 
     def _remove_bias(self, bias_radps: FloatArray) -> None:
         """Integrate the gyro anew, less a bias."""
         self._gyro_bias = bias_radps
-        self._attitude = np.concatenate(
-            [np.eye(3)[None], chain_rotations(self._turn(self._nodes[:-1], self._nodes[1:]))]
-        )
+        self._attitude = integrated_attitudes(self._pieces, self._nodes, bias_radps)
 
-    def _turn(self, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        # Over 2.5 ms the integral of the rate is the rotation vector: coning is below 1e-8 rad.
-        dt = (end_s - start_s)[:, None]
-        return matrix_from_rvec(
-            self._signal.angle_at(end_s) - self._signal.angle_at(start_s) - dt * self._gyro_bias
-        )
+    def _hats(self, t_s: FloatArray, segment: IntArray) -> tuple[IntArray, FloatArray, int]:
+        """Return hat functions of time, separate for each stretch between IMU gaps.
 
-    def _gyro_attitude(self, t_s: FloatArray) -> FloatArray:
-        i = np.clip(np.searchsorted(self._nodes, t_s) - 1, 0, len(self._nodes) - 2)
-        return np.asarray(self._attitude[i] @ self._turn(self._nodes[i], t_s))
-
-    def _drift_basis(self, t_s: FloatArray, segment: IntArray) -> FloatArray:
-        """Return hat functions of time, shape (n, n_knots), separate for each stretch between IMU gaps."""
-        columns = []
+        Of each frame: the knot before it, and its share of the way to the next; and how many knots there are.
+        """
+        knot, share = np.zeros(len(t_s), dtype=np.int64), np.zeros(len(t_s))
+        n_before = 0
         for k in np.unique(segment):
             inside = segment == k
             lo, hi = t_s[inside].min(), t_s[inside].max()
             n_knots = max(2, round((hi - lo) / _KNOT_S) + 1)
-            knots = np.linspace(lo - 1e-6, hi + 1e-6, n_knots)
-            for j in range(n_knots):
-                columns.append(np.where(inside, np.interp(t_s, knots, np.eye(n_knots)[j]), 0.0))
-        return np.stack(columns, axis=1)
+            place = (t_s[inside] - lo) / (hi - lo) * (n_knots - 1)
+            first = np.minimum(place.astype(np.int64), n_knots - 2)
+            knot[inside], share[inside] = n_before + first, place - first
+            n_before += n_knots
+        return knot, share, n_before
 
     def _frames_beside_gyro(self, offset_s: float) -> tuple[BoolArray, IntArray]:
         """Return the frames whose IMU time has samples around, and the stretch between long gaps of each."""
@@ -172,42 +172,28 @@ class RotationFit:
         if inside.sum() < MIN_POSES:
             return None
         t, R, inverse_sd = self._t[inside], self._R[inside], 1 / self._sd[inside]
-        basis = self._drift_basis(t, segment[inside])
-        n, n_knots = basis.shape
-        self._remove_bias(np.zeros(3))
+        knot, share, n_knots = self._hats(t, segment[inside])
+        n, since_mid = len(t), t - self._t_mid
+        self._gyro_bias, self._attitude = np.zeros(3), self._unbiased
         offset, skew, sd = float(offset_s), 0.0, float("nan")
         covariance, bias_covariance = np.eye(3), np.eye(3)
         prior = np.diag([0.0, self._skew_prior_sd**-2, LOSS_PRIOR_SD_S2**-2])
         lost = 0.0
         weight = np.ones(n)
         for iteration in range(12):
-            t_imu = t + offset + skew * (t - self._t_mid)
-            attitude = self._gyro_attitude(t_imu)
-            # Misalignment of optics to gyro in the axes of the gyro's start: constant but for its drift.
-            reference = R[0] @ attitude[0].T
-            turn = rvec_from_matrix(np.swapaxes(reference @ attitude, 1, 2) @ R)
-            error = np.einsum("nij,nj->ni", attitude, turn)
-            rate = np.einsum("nij,nj->ni", attitude, self._signal.gyro_at(t_imu) - self._gyro_bias)
+            t_imu = t + offset + skew * since_mid
+            attitude, error, design = compare_with_gyro(
+                self._pieces, self._nodes, self._attitude, self._gyro_bias, t_imu, since_mid, R
+            )
             w = weight * inverse_sd
-            Q, _ = np.linalg.qr(w[:, None] * basis)
-            # A low-pass takes c times its second derivative from the rate, and so c times its first from
-            # the angle.
-            slow = np.einsum("nij,nj->ni", attitude, self._signal.gyro_rate_at(t_imu))
-            # (n, 3, [offset, skew, c])
-            design = np.stack([rate, (t - self._t_mid)[:, None] * rate, -slow], axis=2)
-            # The knots are eliminated: what they can explain is taken out of both sides.
-            A = np.einsum("n,nij->nij", w, design)
-            A = A - np.einsum("nk,mk,mij->nij", Q, Q, A, optimize=True)
-            y = w[:, None] * error
-            y = y - Q @ (Q.T @ y)
-            normal = np.einsum("nij,nik->jk", A, A) + prior
+            normal, right = normal_equations(w, knot, share, n_knots, design, error)
+            normal += prior
             if not (np.isfinite(normal).all() and normal[0, 0] > 0):
                 return None
-            right = np.einsum("nij,ni->j", A, y) - np.array([0.0, skew, 0.0]) @ prior
-            step = np.linalg.solve(normal, right)
+            step = np.linalg.solve(normal, right - np.array([0.0, skew, 0.0]) @ prior)
             remainder = error - design @ step
             lost = float(step[2])
-            drift = basis @ np.linalg.lstsq(w[:, None] * basis, w[:, None] * remainder, rcond=None)[0]
+            drift = drift_of(w, knot, share, n_knots, remainder)
             residual = np.linalg.norm((remainder - drift) * inverse_sd[:, None], axis=1) / np.sqrt(3)
             freedom = max(n - n_knots - 1, 1) / n
             # The median of sqrt(chi-square of 3 / 3) is 0.888.

@@ -35,7 +35,7 @@ class SignalPieces(NamedTuple):
 
 
 @compiled
-def _piece_of(knots_s: FloatArray, t_s: float, near: int) -> int:
+def piece_of(knots_s: FloatArray, t_s: float, near: int) -> int:
     """Return the piece that holds an instant, looked for from a piece nearby."""
     last = len(knots_s) - 2
     i = min(max(near, 0), last)
@@ -55,6 +55,17 @@ def _value(coefficients: FloatArray, i: int, axis: int, s: float) -> float:
     for k in range(1, coefficients.shape[0]):
         value = value * s + coefficients[k, i, axis]
     return float(value)
+
+
+@compiled
+def held_value(
+    integral: FloatArray, signal: FloatArray, i: int, axis: int, t_s: float, pieces: SignalPieces
+) -> float:
+    """Return an integral of a signal that is held constant beyond the samples; ``i`` is the piece there."""
+    held = min(max(t_s, pieces.span_s[0]), pieces.span_s[1])
+    s = held - pieces.knots_s[i]
+    value = _value(integral, i, axis, s)
+    return value if t_s == held else value + _value(signal, i, axis, s) * (t_s - held)
 
 
 @compiled
@@ -94,12 +105,9 @@ def integrate_steps(
             since = dt * k / (2.0 * SUBSTEPS)
             t = start_s[n] + since
             held = min(max(t, low), high)
-            i = _piece_of(knots, held, i)
-            s = held - knots[i]
+            i = piece_of(knots, held, i)
             for a in range(3):
-                angle[a] = _value(pieces.angle, i, a, s) - gyro_bias[n, a] * since
-                if t != held:
-                    angle[a] += _value(pieces.gyro, i, a, s) * (t - held)
+                angle[a] = held_value(pieces.angle, pieces.gyro, i, a, t, pieces) - gyro_bias[n, a] * since
             if k > 0:
                 for a in range(3):
                     row[a] = angle[a] - angle_before[a]
@@ -107,7 +115,7 @@ def integrate_steps(
             if k % 2 == 0:
                 t += acc_lag_s
                 held = min(max(t, low), high)
-                j = _piece_of(knots, held, j)
+                j = piece_of(knots, held, j)
                 s, beyond = held - knots[j], t - held
                 for a in range(3):
                     force = _value(pieces.acc, j, a, s)
