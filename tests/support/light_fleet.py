@@ -2,15 +2,18 @@
 
 ``python light_fleet.py FOLDER NAME...`` serves a unit for each name from ``FOLDER/<name>`` and prints a JSON
 object of their ports. Then each line that comes in is an order: ``trigger N_BYTES`` makes every armed unit save
-a real run folder, whose video is that long, and go idle; ``quit`` ends the process.
+a real run folder, whose video is that long, and go idle; ``record FOLDER`` makes them save a copy of that run, as
+if they had recorded it; ``quit`` ends the process.
 """
 
 import json
 import random
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 from device_fakes import FakeRig
 
 from bricktrack_common.run_manifest import (
@@ -20,6 +23,7 @@ from bricktrack_common.run_manifest import (
     RunManifest,
     TriggerSection,
     file_entry,
+    read_manifest,
     write_manifest,
 )
 from bricktrack_common.wire_messages import Armed, Disarmed
@@ -69,6 +73,19 @@ class StateOnly:
             trigger=TriggerSection(pin="GPIO17", t0_ns=None), clocks=ClocksSection(), window_ns=None,
             quality=QualitySection(), missing=[], files=[file_entry(folder / "video.h264")],
         )  # fmt: skip
+        self._end(folder, manifest)
+
+    def record(self, recorded: Path) -> None:
+        if self.state != "armed":
+            return
+        folder = self._store.runs / f"{self.run_id}.partial"
+        manifest = read_manifest(recorded / MANIFEST_NAME)
+        folder.mkdir()
+        for entry in manifest.files:
+            shutil.copy2(recorded / entry.name, folder)
+        self._end(folder, msgspec.structs.replace(manifest, run_id=self.run_id, unit=self._store.unit))
+
+    def _end(self, folder: Path, manifest: RunManifest) -> None:
         write_manifest(folder / MANIFEST_NAME, manifest)
         folder.rename(self._store.runs / self.run_id)
         self.state, self.run_id = "idle", ""
@@ -99,7 +116,10 @@ def serve(folder: Path, names: list[str]) -> None:
         if order == ["quit"]:
             break
         for recorder in recorders:
-            recorder.save(draw.randbytes(int(order[1])))
+            if order[0] == "record":
+                recorder.record(Path(line.split(maxsplit=1)[1].rstrip("\n")))
+            else:
+                recorder.save(draw.randbytes(int(order[1])))
         print("saved", flush=True)
     for server in servers:
         server.stop()
@@ -136,8 +156,15 @@ class LightFleet:
 
     def trigger(self, n_bytes: int) -> None:
         """Make every armed unit record and save a run."""
+        self._order(f"trigger {n_bytes}")
+
+    def record(self, folder: Path) -> None:
+        """Make every armed unit save a copy of this run as its own."""
+        self._order(f"record {folder}")
+
+    def _order(self, order: str) -> None:
         for process in self._processes:
-            print(f"trigger {n_bytes}", file=process.stdin, flush=True)
+            print(order, file=process.stdin, flush=True)
         for process in self._processes:
             self._heard(process)
 
