@@ -1,12 +1,14 @@
 """From a recording (simulated) whose camera is shaken and rocked to its fused motion, by the command line."""
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
-from shaken_pair import make_shaken_pair
+from shaken_pair import import_twin, make_shaken_pair
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import ConfigError, RunFormatError
 from bricktrack_common.run_folder import read_run
+from bricktrack_host.assemblies.combined_test import read_test
 from bricktrack_host.cli.main import app
 from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE
 from bricktrack_host.quality import PoseFlag
@@ -21,12 +23,34 @@ pytestmark = pytest.mark.slow
 _UNIT = '[[unit]]\nname = "b7-2"\ncalibration = "calibration.json"\nlayout = "kit/layout.toml"\n'
 _OTHER = '[[unit]]\nname = "b7-1"\n'
 _IMU = "[unit.camera_imu]\nto_camera_mm = [-18.0, 25.0, 7.0]\n"
+_TWIN = _UNIT.replace("b7-2", "b7-3").replace("calibration.json", "twin.json")
+_BRICK = """
+[[assembly]]
+name = "brick-7"
+kind = "DCB"
+base = "A"
+[[assembly.component]]
+name = "A"
+[[assembly.component]]
+name = "B"
+[[assembly.view]]
+unit = "b7-2"
+camera_on = "A"
+leds_on = "B"
+position_brick_layout_mm = [10.0, 20.0, 30.0]
+[[assembly.view]]
+unit = "b7-3"
+camera_on = "A"
+leds_on = "B"
+position_brick_layout_mm = [10.0, 20.0, 30.0]
+"""
 _FLEETS = {
     "own": f'{_UNIT}camera = "imu"\n{_IMU}imu = "camera"\n{_OTHER}',
     "other": f'{_UNIT}camera = "imu"\n{_IMU}imu = "brick"\nunit = "b7-1"\n{_OTHER}',
     "none": f'{_UNIT}camera = "imu"\n{_OTHER}',
     "table": f'{_UNIT}camera = "table"\n[unit.camera_table]\ncolumns = ["AX", "AY", "AZ"]\n'
     f'measured_in = "g"\n{_OTHER}',
+    "twins": f'{_UNIT}camera = "imu"\n{_IMU}{_TWIN}camera = "imu"\n{_IMU}{_BRICK}',
 }
 
 
@@ -120,3 +144,56 @@ def test_what_is_missing_is_named_with_its_remedy(pair, tmp_path):
     chosen = sensor(pair, "table", table=pair.table)
     assert read_camera_sensor(read_run(pair.run), chosen, None, problems) is None
     assert "no time here" in problems[0]
+
+
+@pytest.fixture(scope="module")
+def combined(pair):
+    """Two units that saw one shake, of which one missed the wave's first two edges, processed and combined."""
+    import_twin(pair, missed_edges=2)
+    calibration = pair.calibration.read_text().replace('"b7-2"', '"b7-3"')
+    (pair.folder / "twin.json").write_text(calibration)
+    fleet = ["--fleet", str(pair.folder / "twins.toml")]
+    runs = [str(pair.folder / "runs" / f"{unit}_shake-12") for unit in ("b7-2", "b7-3")]
+    for run in runs:
+        done = CliRunner().invoke(app, ["process", run, *fleet], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    done = CliRunner().invoke(app, ["combine", *runs, "--name", "shake-12", *fleet], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return pair.folder / "tests" / "shake-12", done.output
+
+
+def test_edges_missed_by_one_unit_are_found_and_its_samples_put_right(combined):
+    folder, said = combined
+    units = {entry.unit: entry for entry in read_test(folder).units}
+    assert {unit: (entry.edges, entry.slip_samples) for unit, entry in units.items()} == {
+        "b7-2": ("agrees", 0), "b7-3": ("corrected", 2),
+    }  # fmt: skip
+    assert "edge 0 is the wave's edge +2" in said.replace("\n", " ")
+    [loop] = read_test(folder).assemblies[0].loops
+    assert loop["rms_mm"] < 0.03  # 10 ms of slip at some 100 mm/s would be 1 mm
+
+
+def test_the_laboratorys_table_gets_the_motion_of_each_sample(pair, combined):
+    folder, _ = combined
+    output = folder / "merged.parquet"
+    arguments = ["export", str(folder), "--daq", str(pair.table), "--sample-column", "Sample"]
+    arguments += ["--first-sample", "1", "--format", "parquet", "--output", str(output)]
+    done = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    merged = pq.read_table(output).to_pydict()
+    channels = np.genfromtxt(pair.table, delimiter=",", names=True)
+    np.testing.assert_array_equal(np.array(merged["sample"]) + 1, channels["Sample"])
+    np.testing.assert_allclose(merged["AX"], channels["AX"])
+    # The row of sample n holds the motion at edge n: 5 ms earlier or later it would be another by 0.1 mm and more.
+    edges = read_run(pair.run).edges_ns
+    truth = read_true_motion(pair.truth)
+    R, t_mm = truth.at(edges)
+    R_rest, t_rest = truth.at(edges[:1])
+    shift = (t_mm - t_rest) @ R_rest[0]
+    found = np.stack([np.array(merged[f"d{a}_mm"], dtype=float) for a in "xyz"], axis=1)
+    arm = -np.array([10.0, 20.0, 30.0])  # of the brick's origin, seen from the layout's
+    expected = shift + np.einsum("ji,njk,k->ni", R_rest[0], R, arm) - arm
+    off = np.linalg.norm(found - expected, axis=1)
+    assert np.nanmedian(off) < 0.02
+    late = np.linalg.norm(found[1:] - expected[:-1], axis=1)
+    assert np.nanmedian(late) > 3 * np.nanmedian(off)

@@ -6,7 +6,7 @@ another clock; the laboratory's table of the same acceleration can be written to
 """
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +46,7 @@ class ShakenPair:
     truth: Path
     table: Path
     to_camera_mm: tuple[float, float, float]
+    rig: LooseRig
 
 
 def make_shaken_pair(
@@ -83,11 +84,8 @@ def make_shaken_pair(
         folder / "runs",
     )  # fmt: skip
 
-    def by_other_clock(t: IntArray) -> IntArray:
-        return t + OTHER_OFFSET_NS + np.rint((OTHER_RATE - 1) * (t - first_ns)).astype(np.int64)
-
-    _restamp(folder / "camera.csv", folder / "other_imu.csv", by_other_clock(t_ns))
-    _write_edges(folder / "other_edges.csv", by_other_clock(edges))
+    _restamp(folder / "camera.csv", folder / "other_imu.csv", first_ns)
+    _restamp(folder / "edges.csv", folder / "other_edges.csv", first_ns)
     other = import_recording(
         Recording(
             **shared, unit="b7-1", timestamps=folder / "stamps.txt", edges=folder / "other_edges.csv",
@@ -101,7 +99,7 @@ def make_shaken_pair(
     arm = settings.imu.on_camera_mm
     return ShakenPair(
         folder, run.folder, other.folder, folder / "calibration.json", kit / "layout.toml", folder / "truth.npz",
-        folder / "table.csv", (-arm[0], -arm[1], -arm[2]),
+        folder / "table.csv", (-arm[0], -arm[1], -arm[2]), rig,
     )  # fmt: skip
 
 
@@ -141,10 +139,38 @@ def _write_imu(path: Path, sensors: ImuSensors, t_ns: IntArray) -> None:
             writer.writerow([t, *(f"{x:.2f}" for x in acc), *(f"{x:.4f}" for x in gyro)])
 
 
-def _restamp(source: Path, target: Path, t_ns: IntArray) -> None:
+def by_other_clock(t_ns: int, first_ns: int) -> int:
+    """Return an instant by the other unit's clock."""
+    return t_ns + OTHER_OFFSET_NS + round((OTHER_RATE - 1) * (t_ns - first_ns))
+
+
+def _restamp(source: Path, target: Path, first_ns: int, *, leave_out: int = 0) -> None:
+    """Copy a file of instants by the other unit's clock, without its first rows."""
     head, *rows = source.read_text().splitlines()
-    moved = [f"{t},{row.partition(',')[2]}" for t, row in zip(t_ns.tolist(), rows, strict=True)]
+    moved = []
+    for row in rows[leave_out:]:
+        t, comma, rest = row.partition(",")
+        moved.append(f"{by_other_clock(int(t), first_ns)}{comma}{rest}")
     target.write_text("\n".join([head, *moved]) + "\n")
+
+
+def import_twin(pair: ShakenPair, *, missed_edges: int) -> Path:
+    """Import the same pictures and chips as unit b7-3 saw them: by its own clock, without the first edges."""
+    folder = pair.folder
+    first_ns = int((folder / "edges.csv").read_text().splitlines()[1])
+    for name in ("brick", "camera"):
+        _restamp(folder / f"{name}.csv", folder / f"twin_{name}.csv", first_ns)
+    _restamp(folder / "edges.csv", folder / "twin_edges.csv", first_ns, leave_out=missed_edges)
+    stamp = by_other_clock(pair.rig.first_sensor_timestamp_ns, first_ns)
+    rig = replace(pair.rig, first_sensor_timestamp_ns=stamp)
+    imus = {name: folder / f"twin_{name}.csv" for name in ("brick", "camera")}
+    return import_recording(
+        Recording(
+            rig=rig, label="shake-12", simulated=True, video=folder / "video.h264", unit="b7-3", imus=imus,
+            timestamps=folder / "stamps.txt", edges=folder / "twin_edges.csv",
+        ),
+        folder / "runs",
+    ).folder  # fmt: skip
 
 
 def _write_edges(path: Path, edges_ns: IntArray) -> None:

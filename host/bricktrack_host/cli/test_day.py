@@ -8,8 +8,15 @@ import typer
 from rich.table import Table
 
 from bricktrack_common.errors import BricktrackError, ConfigError
-from bricktrack_common.run_manifest import MANIFEST_NAME
-from bricktrack_common.wire_messages import Armed
+from bricktrack_common.wire_messages import Armed, StatusReply
+from bricktrack_host.campaign.arming_round import (
+    ArmingRound,
+    Standing,
+    close_round,
+    load_round,
+    runs_here,
+    save_round,
+)
 from bricktrack_host.campaign.readiness import obstacles
 from bricktrack_host.campaign.test_plan import (
     COMBINED_FOLDER,
@@ -19,8 +26,9 @@ from bricktrack_host.campaign.test_plan import (
     load_plan,
     newest,
     save_plan,
+    unit_of,
 )
-from bricktrack_host.cli._acknowledged import ask_for, report_answers
+from bricktrack_host.cli._acknowledged import ask_for, report_answers, some_names
 from bricktrack_host.cli._console import err, out, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
 from bricktrack_host.cli._processing import (
@@ -79,8 +87,15 @@ def new(
         bricktrack test new shake-12 --unit 'b7-*' --duration 20
     """
     chosen = choose_units(fleet, unit, None, timeout_s=timeout)
+    folder = folder_of_test(fleet_path(fleet), name)
     plan = PlannedTest(name=name, units=[u.name for u in chosen.units], duration_s=duration)
-    save_plan(folder_of_test(fleet_path(fleet), name), plan)
+    save_plan(folder, plan)
+    here = runs_here(_runs_folder(chosen), plan, load_round(folder))
+    if here:
+        raise ConfigError(
+            f"the test {name} is recorded already: {len(here)} of its runs are here. Choose another name for a "
+            f"new one; 'bricktrack test arm {name} --again' records this one once more"
+        )
     _look(chosen, name)
 
 
@@ -118,29 +133,49 @@ def arm(
         bricktrack test arm shake-12 --again
     """
     plan, chosen = _planned(name, fleet, timeout)
+    folder = folder_of_test(fleet_path(fleet), name)
+    looks = ask_for(chosen, lambda c: (c.client.status(), _run_ids(c)), doing="looking at")
+    going = _round_to_go(folder, plan, chosen, looks, again=again)
+    standings = [
+        look if isinstance(look, BricktrackError) else going.standing_of(u.name, *look, name)
+        for u, look in zip(chosen.units, looks, strict=True)
+    ]
+    _refuse_another_shake(name, chosen, standings)
+    arming = dict(zip((u.name for u in chosen.units), standings, strict=True))
 
     def make_ready(contact: Contact) -> Armed:
-        now = contact.client.status()
-        if now.state in ("armed", "recording", "saving") and is_of_test(now.run_id, name):
-            return Armed(run_id=now.run_id, missing=[])
-        recorded = newest(r.run_id for r in contact.client.list_runs().runs if is_of_test(r.run_id, name))
-        if recorded is not None and not again:
-            return Armed(run_id=recorded, missing=[])
+        standing = arming[contact.unit.name]
+        if isinstance(standing, BricktrackError):
+            raise standing
+        if standing.kind != "idle":
+            return Armed(run_id=standing.run_id, missing=[])
         return contact.client.arm(name, duration_s=plan.duration_s)
 
     answers = ask_for(chosen, make_ready, doing="arming")
+    has_run = {u for u, s in arming.items() if isinstance(s, Standing) and s.kind == "recorded"}
     all_armed = report_answers(
-        chosen.units, answers, done="armed or done", words=lambda a: f"run {a.run_id}", details=lambda _: {},
-        as_json=False,
+        chosen.units, answers, done="have their run" if has_run else "armed",
+        words=lambda a: f"{'has' if unit_of(a.run_id) in has_run else 'armed,'} run {a.run_id}",
+        details=lambda _: {}, as_json=False,
     )  # fmt: skip
     armed = {u.name: a for u, a in zip(chosen.units, answers, strict=True) if isinstance(a, Armed)}
     for unit, answer in armed.items():
         for words in answer.missing:
             err.print(f"{unit}: without {words}", style="yellow", markup=False, soft_wrap=True)
+    if has_run:
+        words = (
+            f"nothing was armed: {name} is recorded. 'bricktrack test arm {name} --again' records once more"
+        )
+        err.print(words, style="yellow", markup=False, soft_wrap=True)
     if not all_armed:
-        say_error(f"'bricktrack test arm {name}' arms the rest; 'bricktrack disarm' brings all back")
+        if armed and not has_run:
+            say_error(
+                f"the {len(armed)} that are armed record at the first edge. 'bricktrack test arm {name}' arms "
+                "the rest; 'bricktrack disarm' calls it off"
+            )
         raise typer.Exit(EXIT_ERROR)
     if not wait:
+        close_round(folder, going)
         return
     try:
         good = wait_until_saved(
@@ -150,7 +185,12 @@ def arm(
         raise KeyboardInterrupt(
             f"Interrupted; the units stay armed. 'bricktrack test arm {name}' waits again."
         ) from e
+    close_round(folder, going)
     if not good:
+        say_error(
+            f"'bricktrack test collect {name}' brings what there is; 'bricktrack test arm {name} --again' "
+            "records once more with all"
+        )
         raise typer.Exit(EXIT_ERROR)
     out.print(f"all runs are saved; next: bricktrack test collect {name}", markup=False)
 
@@ -177,29 +217,39 @@ def collect(
     """
     where = Where(jobs, scheduler, send, (tls_ca, tls_cert, tls_key))
     plan, chosen = _planned(name, fleet, timeout)
+    going = load_round(folder_of_test(fleet_path(fleet), name))
     runs_folder = _runs_folder(chosen)
     wanted: list[UnitConfig] = []
     run_ids: list[str] = []
     problems: list[str] = []
-    answers = ask_for(chosen, lambda c: c.client.list_runs(), doing="asking")
+    had = runs_here(runs_folder, plan, going)
+    answers = ask_for(chosen, lambda c: (c.client.status(), _run_ids(c)), doing="asking")
     for unit, answer in zip(chosen.units, answers, strict=True):
         if isinstance(answer, BricktrackError):
-            if unit.name not in _runs_here(runs_folder, plan):
+            if unit.name not in had:
                 problems.append(f"{unit.name}: {answer}")
             continue
-        run_id = newest(r.run_id for r in answer.runs if is_of_test(r.run_id, name))
+        standing = going.standing_of(unit.name, *answer, name)
+        run_id = going.run_of(unit.name, answer[1], name)
         if run_id is not None:
             wanted.append(unit)
             run_ids.append(run_id)
-        elif unit.name not in _runs_here(runs_folder, plan):
-            problems.append(f"{unit.name}: has no run of {name}. Was it armed?")
+        if standing.kind == "armed":
+            problems.append(
+                f"{unit.name}: is {answer[0].state} for {standing.run_id}; its run is not there yet"
+            )
+        elif run_id is None and unit.name not in had:
+            earlier = newest(r for r in answer[1] if is_of_test(r, name))
+            what = f"no run of {name}" if earlier is None else f"only an earlier run of {name}, {earlier}"
+            problems.append(f"{unit.name}: has {what}. Was it armed?")
     if wanted:
         pulled = pull_with_bars(replace(chosen, units=wanted), runs_folder, PullSettings(run_ids=run_ids))
         problems += [f"{result.unit}: {e}" for result in pulled for e in result.errors]
-    here = _runs_here(runs_folder, plan)
+    here = runs_here(runs_folder, plan, going)
     todo = [run for run in here.values() if not _is_processed(run)]
     out.print(f"{len(here)} of {len(plan.units)} runs are here, {len(todo)} to process", markup=False)
     failed = process_folders(todo, fleet=fleet_path(fleet), where=where)
+    _say_samples(here)
     for problem in problems:
         say_error(problem)
     if problems or failed:
@@ -219,7 +269,8 @@ def report(name: NameArgument, fleet: FleetOption = None) -> None:
     path = fleet_path(fleet)
     folder = folder_of_test(path, name)
     plan = load_plan(folder)
-    runs = _runs_here(_runs_folder(choose_units(fleet, plan.units, None, timeout_s=1.0)), plan)
+    chosen = choose_units(fleet, plan.units, None, timeout_s=1.0)
+    runs = runs_here(_runs_folder(chosen), plan, load_round(folder))
     usable = [run for run in runs.values() if _is_processed(run)]
     missing = [unit for unit in plan.units if unit not in runs or not _is_processed(runs[unit])]
     if not usable:
@@ -241,21 +292,70 @@ def _runs_folder(chosen: ChosenUnits) -> Path:
     return chosen.fleet.runs_path
 
 
-def _runs_here(runs_folder: Path, plan: PlannedTest) -> dict[str, Path]:
-    """Return the newest whole run of each unit of a test on this machine."""
-    runs = {
-        unit: newest(
-            path.name
-            for path in runs_folder.glob(f"{unit}_*_{plan.name}")
-            if is_of_test(path.name, plan.name) and (path / MANIFEST_NAME).is_file()
+def _run_ids(contact: Contact) -> list[str]:
+    return [run.run_id for run in contact.client.list_runs().runs]
+
+
+Look = tuple[StatusReply, list[str]]
+"""What a unit says of itself, and the runs that it has."""
+
+
+def _round_to_go(
+    folder: Path,
+    plan: PlannedTest,
+    chosen: ChosenUnits,
+    looks: list[Look | BricktrackError],
+    *,
+    again: bool,
+) -> ArmingRound:
+    """Return the round that units are armed for; a new one is noted down before any of them is."""
+    going = load_round(folder)
+    before = dict(going.before)
+    for unit, look in zip(chosen.units, looks, strict=True):
+        is_new = again and not going.is_open
+        if isinstance(look, BricktrackError):
+            if is_new:
+                before[unit.name] = None
+        elif is_new or before.get(unit.name, []) is None:
+            before[unit.name] = [run_id for run_id in look[1] if is_of_test(run_id, plan.name)]
+    now = ArmingRound(before=before, is_open=again or going.is_open)
+    if now != going:
+        save_round(folder, now)
+    return now
+
+
+def _refuse_another_shake(
+    name: str, chosen: ChosenUnits, standings: list[Standing | BricktrackError]
+) -> None:
+    """Refuse to arm some units for a shake that others have recorded already."""
+    kinds = {u.name: s.kind for u, s in zip(chosen.units, standings, strict=True) if isinstance(s, Standing)}
+    idle = [unit for unit, kind in kinds.items() if kind == "idle"]
+    recorded = [unit for unit, kind in kinds.items() if kind == "recorded"]
+    if idle and recorded:
+        raise ConfigError(
+            f"{some_names(recorded)} recorded {name} already, and {some_names(idle)} did not: armed now, they "
+            f"would record another shake. 'bricktrack test collect {name}' takes what there is; 'bricktrack "
+            f"test arm {name} --again' records once more with all"
         )
-        for unit in plan.units
-    }
-    return {unit: runs_folder / run_id for unit, run_id in runs.items() if run_id is not None}
 
 
 def _is_processed(run: Path) -> bool:
     return (run / "results" / "summary.json").is_file()
+
+
+def _say_samples(runs: dict[str, Path]) -> None:
+    """Say whether all units number the laboratory's samples alike; 'report' puts right what can be."""
+    from bricktrack_host.results.edge_comparison import compare_runs
+    from bricktrack_host.results.result_store import results_of
+
+    processed = {unit: results_of(run) for unit, run in runs.items() if _is_processed(run)}
+    compared = compare_runs(processed)
+    if compared is None:
+        return
+    for words in compared.problems():
+        err.print(words, style="yellow", markup=False, soft_wrap=True)
+    if not compared.problems():
+        out.print(f"{len(compared.units)} units number the square wave's samples alike", markup=False)
 
 
 def _look(chosen: ChosenUnits, name: str) -> None:
@@ -266,7 +366,11 @@ def _look(chosen: ChosenUnits, name: str) -> None:
         table.add_column(header)
     n_ready = 0
     for unit, answer in zip(chosen.units, answers, strict=True):
-        reasons = [(str(answer), "")] if isinstance(answer, BricktrackError) else obstacles(answer, name)
+        if isinstance(answer, BricktrackError):
+            words, _, remedy = str(answer).partition(". ")
+            reasons = [(words, remedy)]
+        else:
+            reasons = obstacles(answer, name)
         n_ready += not reasons
         for words, remedy in reasons:
             table.add_row(unit.name, "[red]no[/]", words.replace("[", r"\["), remedy.replace("[", r"\["))
@@ -274,5 +378,6 @@ def _look(chosen: ChosenUnits, name: str) -> None:
         out.print(table)
     out.print(f"{n_ready} of {len(chosen.units)} units are ready", markup=False)
     if n_ready < len(chosen.units):
+        err.print(f"mend that, then look again: bricktrack test check {name}", markup=False)
         raise typer.Exit(EXIT_ERROR)
     out.print(f"next: bricktrack test arm {name}", markup=False)

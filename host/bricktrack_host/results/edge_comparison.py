@@ -11,7 +11,8 @@ A witness whose deviation is more than a sixth of a period cannot tell neighbour
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.run_manifest import RunManifest
 from bricktrack_host.results.daq_clock import EdgeFit
-from bricktrack_host.results.result_store import RunResult
+from bricktrack_host.results.result_store import RunResult, read_result
 from bricktrack_host.tracks import ImuTrack
 
 Witness = Literal["end", "date", "motion"]
@@ -138,6 +139,23 @@ def compare_edges(results: Mapping[str, RunResult]) -> EdgeComparison | None:
     return EdgeComparison(
         reference, (UnitSlip(reference, 0, "agrees", ()), *_against(reference, fits, results))
     )
+
+
+def compare_runs(folders: Mapping[str, Path]) -> EdgeComparison | None:
+    """Return how the edge numbers of processed runs of one shake compare; see `compare_edges`.
+
+    Parameters
+    ----------
+    folders : mapping of unit to path
+        Results folders.
+
+    Raises
+    ------
+    RunFormatError
+        If one cannot be read.
+    """
+    # Of each run only what is compared is kept: a hundred units fit into memory.
+    return compare_edges({unit: replace(read_result(path), fused={}) for unit, path in folders.items()})
 
 
 def _against(reference: str, fits: Mapping[str, EdgeFit], results: Mapping[str, RunResult]) -> list[UnitSlip]:
