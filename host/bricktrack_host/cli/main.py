@@ -29,6 +29,7 @@ from bricktrack_host.cli import (
     still,
     target,
     test_day,
+    view,
 )
 from bricktrack_host.cli._console import out, set_up_logging
 from bricktrack_host.cli._errors import BricktrackGroup
@@ -92,6 +93,7 @@ app.command("combine", rich_help_panel=_RUNS)(combine.combine)
 app.add_typer(dataset.app, name="dataset", rich_help_panel=_RUNS)
 app.command("compare", rich_help_panel=_RUNS)(compare.compare)
 app.command("export", rich_help_panel=_RUNS)(export.export)
+app.command("view", rich_help_panel=_RUNS)(view.view)
 app.command("overlay", rich_help_panel=_RUNS)(overlay.overlay)
 app.add_typer(test_day.app, name="test", rich_help_panel=_UNITS)
 app.command("demo", rich_help_panel=_JUDGE)(demo.demo)

@@ -33,10 +33,16 @@ from bricktrack_host.reporting.plots import (
     six_components,
 )
 from bricktrack_host.reporting.quality_plots import frame_intervals_us, imu_lateness_us
-from bricktrack_host.reporting.rate_comparison import compare_rates, imu_minus_camera_ns
+from bricktrack_host.reporting.rate_comparison import compare_rates
 from bricktrack_host.reporting.report import recording_date
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.results.run_summary import KeyFigures, key_figures, main_track, verdict
+from bricktrack_host.results.run_summary import (
+    KeyFigures,
+    imu_minus_camera_ns,
+    key_figures,
+    main_track,
+    verdict,
+)
 from bricktrack_host.results.spectra import MIN_SAMPLES, amplitude_spectrum
 
 INTERACTIVE_NAME = "interactive.html"

@@ -18,10 +18,10 @@ from bricktrack_host.reporting.plots import (
     line,
     mark_events,
 )
-from bricktrack_host.reporting.rate_comparison import compare_rates, imu_minus_camera_ns
+from bricktrack_host.reporting.rate_comparison import compare_rates
 from bricktrack_host.reporting.thinning import thinned_band
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.results.run_summary import KeyFigures
+from bricktrack_host.results.run_summary import KeyFigures, imu_minus_camera_ns
 from bricktrack_host.results.truth import COMPONENTS, TruthComparison
 
 

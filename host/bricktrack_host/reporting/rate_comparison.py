@@ -8,6 +8,7 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.reporting.plots import TimeAxis
 from bricktrack_host.results.result_store import RunResult
+from bricktrack_host.results.run_summary import imu_minus_camera_ns
 
 _MIN_SAMPLES = 10
 
@@ -61,12 +62,6 @@ def compare_rates(result: RunResult) -> RateComparison | None:
         optical_dps=optical_dps,
         difference_dps=mean_dps - offset_dps - optical_dps,
     )
-
-
-def imu_minus_camera_ns(result: RunResult) -> int:
-    """Return what the alignment found between the stamps of the inertial sensor and the camera's."""
-    offset_ms = result.alignment.get("imu_minus_camera_ms", result.alignment.get("offset_ms", 0.0))
-    return round(float(offset_ms) * 1e6) if isinstance(offset_ms, (int, float)) else 0
 
 
 def _means_over(t_s: FloatArray, values: FloatArray, bounds_s: FloatArray) -> FloatArray:

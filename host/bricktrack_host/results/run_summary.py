@@ -62,6 +62,12 @@ def main_track(result: RunResult) -> FusedTrack | None:
     return result.fused.get("imu") or result.fused.get("frame")
 
 
+def imu_minus_camera_ns(result: RunResult) -> int:
+    """Return what the alignment found between the stamps of the inertial sensor and the camera's."""
+    offset_ms = result.alignment.get("imu_minus_camera_ms", result.alignment.get("offset_ms", 0.0))
+    return round(float(offset_ms) * 1e6) if isinstance(offset_ms, (int, float)) else 0
+
+
 def key_figures(result: RunResult) -> KeyFigures:
     """Return the run's key figures."""
     optical = result.optical
