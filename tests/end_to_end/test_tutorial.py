@@ -1,5 +1,7 @@
 """The tutorials are run as a reader would run them: every command of a page, in order, in an empty folder."""
 
+import csv
+import math
 import os
 import re
 import signal
@@ -7,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,7 +32,7 @@ def run_page(name: str, folder: Path) -> list[str]:
         "NO_COLOR": "1",
     }
     page = (TUTORIALS / name).read_text()
-    for file, text in re.findall(r"```toml\n# (\S+)\n(.*?)```", page, flags=re.S):
+    for file, text in re.findall(r"```(?:toml|python)\n# (\S+\.\w+)\n(.*?)```", page, flags=re.S):
         (folder / file).write_text(text)
     outputs = []
     for command in commands_of(page):
@@ -79,3 +82,31 @@ def test_a_test_day_with_a_simulated_unit_ends_in_a_report(tmp_path):
     assert "Errors against simulated truth" in outputs[7]
     assert (tmp_path / "stills" / "b7-1_leds.png").exists()
     assert (tmp_path / "tests" / "shake-12" / "combined" / "report.html").exists()
+
+
+@pytest.mark.slow
+def test_the_parts_of_a_brick_move_as_they_were_made_to(tmp_path):
+    (tmp_path / "scripts").symlink_to(ROOT / "scripts")
+    *_, combined, _, wrong, _, _, amplitudes = run_page("assembly.md", tmp_path)
+    # What the page says, and what the simulation was told: no run of bricktrack's made lab/truth.csv.
+    peaks = true_peaks_mm(tmp_path / "lab" / "truth.csv")
+    assert peaks == {"B": "4.125", "C": "8.728"}
+    assert "3 on the same samples" in combined
+    for component, peak_mm in peaks.items():
+        [row] = [line for line in combined.splitlines() if f"│ {component} " in line]
+        assert float(re.findall(r"\d+\.\d+", row)[0]) == pytest.approx(float(peak_mm), abs=0.02)
+        assert f"{component}: 6 tables" in amplitudes
+    assert "wrong" not in combined
+    assert "b7-2: the loop that it closes gapes" in wrong
+    table = np.loadtxt(tmp_path / "C_ux_mm.txt", delimiter=None)
+    assert table.shape[1] == 2 and np.isfinite(table).all()
+
+
+def true_peaks_mm(file):
+    """Return each component's largest displacement, as text with three decimals."""
+    peaks = {}
+    with file.open() as rows:
+        for row in csv.DictReader(rows):
+            mm = math.hypot(*(float(row[f"d{axis}_mm"]) for axis in "xyz"))
+            peaks[row["component"]] = max(peaks.get(row["component"], 0.0), mm)
+    return {component: f"{mm:.3f}" for component, mm in peaks.items()}
