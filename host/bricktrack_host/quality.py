@@ -53,7 +53,7 @@ class PoseFlag(IntFlag):
     EXTRAPOLATED = 2048
     """Fused: before the first or after the last optical pose."""
     OPTICAL_ONLY = 4096
-    """Fused: no inertial data were used; smoothed from the optical poses alone."""
+    """Fused: smoothed from the optical poses alone; the position owes nothing to inertial data."""
 
 
 def describe(flags: int) -> str:

@@ -2,9 +2,13 @@
 
 Between frames the jerk is taken for white noise; its strength is chosen by the likelihood of the frames. In a
 gap the covariance grows with the fifth power of time, and poses too unsure are NaN.
+
+Where a camera moves unfelt, the brick's IMU cannot be fused, but it can hint: its gyro takes the brick's own
+turning out of the attitudes, and what is left to smooth is the camera's; its accelerometer marks impacts, at
+which the velocity may jump.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -13,6 +17,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_common.rotations import matrix_from_rvec, right_jacobian, rvec_from_matrix
 from bricktrack_host.fusion.imu_signal import seconds_since
+from bricktrack_host.fusion.inertial_hint import Felt, InertialHint
 from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, has_pose
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import FusedTrack, OpticalTrack
@@ -22,6 +27,7 @@ _MAX_TURN_RAD = 2.5  # rotation vectors from the middle attitude stay smooth bel
 _INNOVATION_GATE = 63.0  # five times the 95 % point of chi-square with 6: real motion is not stationary
 _NIS_CAP = 200.0  # so that an outlier does not choose the jerk
 _JERK_WINDOW_S = 0.5
+_VELOCITY = np.arange(9, 12)  # of the position, among the states
 # Densities of white jerk tried, rad^2/s^5 and mm^2/s^5: from a brick at rest to 50 mm at 10 Hz.
 _ROTATION_JERK = 10.0 ** np.arange(-4.0, 8.5, 1.0)
 _POSITION_JERK = 10.0 ** np.arange(-1.0, 11.5, 1.0)
@@ -65,11 +71,18 @@ def _jerk_noise(dt_s: float) -> FloatArray:
 class _Smoother:
     """Kalman filter and smoother of [rotation vector, position], rate and acceleration: 18 states.
 
-    A batch of jerk densities runs side by side, shape (n, B, 6): row k holds from node k - 1 to k.
+    A batch of jerk densities runs side by side, shape (n, B, 6): row k holds from node k - 1 to k, and so do
+    the sd of the jumps of velocity, ``kick_mmps``, shape (n,).
     """
 
     def __init__(
-        self, t_s: FloatArray, frame: IntArray, z: FloatArray, cov: FloatArray, jerk: FloatArray
+        self,
+        t_s: FloatArray,
+        frame: IntArray,
+        z: FloatArray,
+        cov: FloatArray,
+        jerk: FloatArray,
+        kick_mmps: FloatArray,
     ) -> None:
         n, n_runs = len(t_s), jerk.shape[1]
         self.x, self.P = np.empty((n, n_runs, 18)), np.empty((n, n_runs, 18, 18))
@@ -88,6 +101,7 @@ class _Smoother:
                 x = x @ F.T
                 Q = np.einsum("ij,bk,kl->bikjl", _jerk_noise(dt), jerk[k], np.eye(6)).reshape(n_runs, 18, 18)
                 P = F @ P @ F.T + Q
+                P[:, _VELOCITY, _VELOCITY] += kick_mmps[k] ** 2
             self._x_pred[k], self._P_pred[k] = x, P
             if frame[k] >= 0:
                 R = cov[frame[k]]
@@ -116,7 +130,7 @@ class _Smoother:
         return x, P
 
 
-def _choose_jerk(t_s: FloatArray, z: FloatArray, cov: FloatArray) -> FloatArray:
+def _choose_jerk(t_s: FloatArray, z: FloatArray, cov: FloatArray, kick_mmps: FloatArray) -> FloatArray:
     """Return the likeliest density of white jerk around each frame, shape (n, 6).
 
     Rotation and position each share one over their axes. A brick rests, shakes and rests: the likelihood is
@@ -126,7 +140,7 @@ def _choose_jerk(t_s: FloatArray, z: FloatArray, cov: FloatArray) -> FloatArray:
     window = max(round(_JERK_WINDOW_S / float(np.median(np.diff(t_s)))), 5)
 
     def best(trial: FloatArray, densities: FloatArray) -> FloatArray:
-        ll = _Smoother(t_s, index, z, cov, trial).log_likelihood
+        ll = _Smoother(t_s, index, z, cov, trial, kick_mmps).log_likelihood
         local = uniform_filter1d(ll, window, axis=0, mode="nearest") * window + 0.02 * ll.sum(axis=0)
         return np.asarray(densities[np.argmax(local, axis=1)])
 
@@ -146,6 +160,7 @@ def smooth_optical(
     output_t_ns: IntArray,
     *,
     settings: OpticalSmoothingSettings | None = None,
+    hint: InertialHint | None = None,
 ) -> FusedTrack:
     """Return the motion from optical poses alone, at any instants.
 
@@ -156,6 +171,9 @@ def smooth_optical(
     output_t_ns : ndarray of int64, shape (m,), camera time
         In any order.
     settings : OpticalSmoothingSettings, optional
+    hint : InertialHint, optional
+        Where the camera moves and only the brick's IMU feels anything: impacts are marked and the velocity
+        may jump there, and attitudes are smoothed less what the gyro says, where that leaves them calmer.
 
     Returns
     -------
@@ -180,38 +198,105 @@ def smooth_optical(
     frame_ns = optical.t_ns[seen]
     if (np.diff(frame_ns) <= 0).any():
         raise ShapeError("stamps of the optical poses do not increase; sort the frames")
-    epoch_ns = int(frame_ns[0])
-    R, p_mm = optical.R_camera_brick[seen], optical.t_camera_brick_mm[seen]
-    middle = R[len(R) // 2]
-    rvec = rvec_from_matrix(middle.T @ R)
-    farthest = float(np.linalg.norm(rvec, axis=1).max())
-    if farthest > _MAX_TURN_RAD:
-        raise TrackingError(
-            f"the brick turns by {np.degrees(farthest):.0f} degrees from its middle attitude; "
-            "smoothing of poses alone reaches 143"
-        )
-    floor = np.diag(np.repeat([MIN_ROTATION_SD_RAD**2, _MIN_POSITION_SD_MM**2], 3))
-    cov = 0.5 * (optical.covariance[seen] + np.swapaxes(optical.covariance[seen], 1, 2)) + floor
-    to_rvec = np.zeros((len(rvec), 6, 6))
-    to_rvec[:, :3, :3] = np.linalg.inv(right_jacobian(rvec))
-    to_rvec[:, 3:, 3:] = np.eye(3)
-    z, z_cov = np.concatenate([rvec, p_mm], axis=1), to_rvec @ cov @ np.swapaxes(to_rvec, 1, 2)
+    felt = None if hint is None else Felt(hint)
+    turning = felt
+    if felt is not None:
+        R = optical.R_camera_brick[seen]
+        left = R @ np.swapaxes(felt.turned(frame_ns), 1, 2)
+        turning = felt if _restlessness(frame_ns, left) < _restlessness(frame_ns, R) else None
+    return _Smoothing(optical, seen, turning, felt, settings).at(output_t_ns)
 
-    t_frame = seconds_since(frame_ns, epoch_ns)
-    good = _good_frames(t_frame, z, z_cov, settings.gate_chi2)
-    frame_ns, t_frame, z, z_cov = frame_ns[good], t_frame[good], z[good], z_cov[good]
-    jerk = _choose_jerk(t_frame, z, z_cov)
-    t_ns, back = np.unique(np.concatenate([frame_ns, output_t_ns]), return_inverse=True)
-    frame = np.full(len(t_ns), -1)
-    frame[back[: len(frame_ns)]] = np.arange(len(frame_ns))
-    t_s = seconds_since(t_ns, epoch_ns)
-    # In an interval between frames the livelier of its ends holds.
-    after = np.clip(np.searchsorted(t_frame, t_s), 1, len(t_frame) - 1)
-    node_jerk = np.maximum(jerk[after], jerk[after - 1])
-    x, P = _Smoother(t_s, frame, z, z_cov, node_jerk[:, None]).smooth()
-    at = back[len(frame_ns) :]
-    common = settings.optical_common_share**2 * np.median(cov[good], axis=0)
-    return _to_track(x[at, 0], P[at, 0], middle, output_t_ns, frame_ns, common, settings)
+
+def _restlessness(t_ns: IntArray, R: FloatArray) -> float:
+    """Return how far attitudes are from the cubic through two neighbours on each side, rad, rms."""
+    t_s, rvec = seconds_since(t_ns, int(t_ns[0])), rvec_from_matrix(R[len(R) // 2].T @ R)
+    k = range(2, len(R) - 2)
+    off = np.array([rvec[i] - _cubic_through(t_s, rvec, i, [i - 2, i - 1, i + 1, i + 2]) for i in k])
+    squares = (off**2).sum(axis=1)
+    # A frame thrown far off, or a dropout, shall not decide.
+    return float(np.sqrt(np.mean(np.minimum(squares, np.quantile(squares, 0.95))))) if k else 0.0
+
+
+class _Smoothing:
+    """One smoothing of the poses, ready for any instants; ``turning`` is taken out of the attitudes."""
+
+    def __init__(
+        self,
+        optical: OpticalTrack,
+        seen: BoolArray,
+        turning: Felt | None,
+        felt: Felt | None,
+        settings: OpticalSmoothingSettings,
+    ) -> None:
+        self._settings, self._turning, self._felt = settings, turning, felt
+        frame_ns, R = optical.t_ns[seen], optical.R_camera_brick[seen]
+        floor = np.diag(np.repeat([MIN_ROTATION_SD_RAD**2, _MIN_POSITION_SD_MM**2], 3))
+        stated = 0.5 * (optical.covariance[seen] + np.swapaxes(optical.covariance[seen], 1, 2)) + floor
+        cov = stated
+        if turning is not None:
+            B = turning.turned(frame_ns)
+            R, cov = R @ np.swapaxes(B, 1, 2), _rotated(stated, B)
+        self._middle = R[len(R) // 2]
+        rvec = rvec_from_matrix(self._middle.T @ R)
+        farthest = float(np.linalg.norm(rvec, axis=1).max())
+        if farthest > _MAX_TURN_RAD:
+            raise TrackingError(
+                f"the brick turns by {np.degrees(farthest):.0f} degrees from its middle attitude; "
+                "smoothing of poses alone reaches 143"
+            )
+        to_rvec = np.zeros((len(rvec), 6, 6))
+        to_rvec[:, :3, :3] = np.linalg.inv(right_jacobian(rvec))
+        to_rvec[:, 3:, 3:] = np.eye(3)
+        z = np.concatenate([rvec, optical.t_camera_brick_mm[seen]], axis=1)
+        z_cov = to_rvec @ cov @ np.swapaxes(to_rvec, 1, 2)
+        self._epoch_ns = int(frame_ns[0])
+        good = _good_frames(seconds_since(frame_ns, self._epoch_ns), z, z_cov, settings.gate_chi2)
+        self._frame_ns, self._z, self._z_cov = frame_ns[good], z[good], z_cov[good]
+        self._t_s = seconds_since(self._frame_ns, self._epoch_ns)
+        self._jerk = _choose_jerk(self._t_s, self._z, self._z_cov, self._kicks(self._frame_ns))
+        self._common = settings.optical_common_share**2 * np.median(stated[good], axis=0)
+
+    def _kicks(self, t_ns: IntArray) -> FloatArray:
+        return np.zeros(len(t_ns)) if self._felt is None else self._felt.kicks_mmps(t_ns)
+
+    def at(self, output_t_ns: IntArray) -> FusedTrack:
+        """Return the motion at instants."""
+        frame_ns, t_frame = self._frame_ns, self._t_s
+        t_ns, back = np.unique(np.concatenate([frame_ns, output_t_ns]), return_inverse=True)
+        frame = np.full(len(t_ns), -1)
+        frame[back[: len(frame_ns)]] = np.arange(len(frame_ns))
+        t_s = seconds_since(t_ns, self._epoch_ns)
+        # In an interval between frames the livelier of its ends holds.
+        after = np.clip(np.searchsorted(t_frame, t_s), 1, len(t_frame) - 1)
+        jerk = np.maximum(self._jerk[after], self._jerk[after - 1])
+        smoother = _Smoother(t_s, frame, self._z, self._z_cov, jerk[:, None], self._kicks(t_ns))
+        x, P = smoother.smooth()
+        at = back[len(frame_ns) :]
+        track = _to_track(x[at, 0], P[at, 0], self._middle, output_t_ns, frame_ns)
+        if self._turning is not None:
+            track = _with_turning(track, self._turning)
+        flags = track.flags
+        if self._felt is not None:
+            flags[self._felt.near_impact(output_t_ns)] |= int(PoseFlag.IMPACT)
+        return _unsure_left_out(replace(track, covariance=track.covariance + self._common), self._settings)
+
+
+def _rotated(covariance: FloatArray, R: FloatArray) -> FloatArray:
+    """Return covariances of [dtheta, dt] with dtheta turned by rotations, shape (n, 3, 3)."""
+    turn = np.zeros((len(R), 6, 6))
+    turn[:, :3, :3], turn[:, 3:, 3:] = R, np.eye(3)
+    return np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
+
+
+def _with_turning(track: FusedTrack, felt: Felt) -> FusedTrack:
+    """Return a motion with the turning put back that had been taken out of its attitudes."""
+    B = felt.turned(track.t_ns)
+    B_back = np.swapaxes(B, 1, 2)
+    omega = np.einsum("nij,nj->ni", B_back, track.omega_brick_radps) + felt.omega_radps(track.t_ns)
+    return replace(
+        track, R_camera_brick=track.R_camera_brick @ B, omega_brick_radps=omega,
+        covariance=_rotated(track.covariance, B_back),
+    )  # fmt: skip
 
 
 def _cubic_through(t_s: FloatArray, z: FloatArray, k: int, others: list[int]) -> FloatArray:
@@ -251,32 +336,38 @@ def _good_frames(t_s: FloatArray, z: FloatArray, cov: FloatArray, gate_chi2: flo
 
 
 def _to_track(
-    x: FloatArray,
-    P: FloatArray,
-    middle: FloatArray,
-    t_ns: IntArray,
-    frame_ns: IntArray,
-    common: FloatArray,
-    settings: OpticalSmoothingSettings,
+    x: FloatArray, P: FloatArray, middle: FloatArray, t_ns: IntArray, frame_ns: IntArray
 ) -> FusedTrack:
     J = np.zeros((len(x), 6, 6))
     J[:, :3, :3] = right_jacobian(x[:, :3])
     J[:, 3:, 3:] = np.eye(3)
-    covariance = J @ P[:, :6, :6] @ np.swapaxes(J, 1, 2) + common
     flags = np.full(len(t_ns), int(PoseFlag.OPTICAL_ONLY), dtype=np.int64)
     period_ns = float(np.median(np.diff(frame_ns)))
     i = np.clip(np.searchsorted(frame_ns, t_ns), 1, len(frame_ns) - 1)
     away_ns = np.minimum(np.abs(t_ns - frame_ns[i]), np.abs(t_ns - frame_ns[i - 1]))
     flags[away_ns > 1.5 * period_ns] |= int(PoseFlag.DROPOUT)
     flags[(t_ns < frame_ns[0]) | (t_ns > frame_ns[-1])] |= int(PoseFlag.EXTRAPOLATED)
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    return FusedTrack(
+        t_ns=t_ns,
+        R_camera_brick=middle @ matrix_from_rvec(x[:, :3]),
+        t_camera_brick_mm=x[:, 3:6].copy(),
+        omega_brick_radps=np.einsum("nij,nj->ni", J[:, :3, :3], x[:, 6:9]),
+        v_camera_mmps=x[:, 9:12].copy(),
+        covariance=J @ P[:, :6, :6] @ np.swapaxes(J, 1, 2),
+        flags=flags,
+    )
+
+
+def _unsure_left_out(track: FusedTrack, settings: OpticalSmoothingSettings) -> FusedTrack:
+    """Make poses that are too unsure NaN, in place."""
+    variance = np.diagonal(track.covariance, axis1=1, axis2=2)
     lost = (variance[:, 3:].max(axis=1) > settings.max_position_sd_mm**2) | (
         variance[:, :3].max(axis=1) > settings.max_rotation_sd_rad**2
     )
-    flags[lost] |= int(PoseFlag.NO_POSE)
-    R = middle @ matrix_from_rvec(x[:, :3])
-    t_mm, v_mmps = x[:, 3:6].copy(), x[:, 9:12].copy()
-    omega = np.einsum("nij,nj->ni", J[:, :3, :3], x[:, 6:9])
-    for values in (R, t_mm, v_mmps, omega, covariance):
+    track.flags[lost] |= int(PoseFlag.NO_POSE)
+    for values in (
+        track.R_camera_brick, track.t_camera_brick_mm, track.v_camera_mmps, track.omega_brick_radps,
+        track.covariance,
+    ):  # fmt: skip
         values[lost] = np.nan
-    return FusedTrack(t_ns, R, t_mm, omega, v_mmps, covariance, flags)
+    return track

@@ -29,12 +29,16 @@ class Inertial:
         What feels the motion of a camera that moves.
     camera_alignment : CameraAlignment or None
         Of both, there.
+    is_hint : bool
+        Whether the camera moves and nothing feels it: the samples cannot be fused, and only hint at turns and
+        impacts.
     """
 
     imu: ImuTrack
     alignment: TimeAlignment
     camera: CameraImu | None = None
     camera_alignment: CameraAlignment | None = None
+    is_hint: bool = False
 
 
 def fit_square_wave(run: Run, problems: list[str]) -> EdgeFit | None:
@@ -104,8 +108,7 @@ def align(
             problems.append(
                 f"the camera moves (camera = {settings.camera!r}): optical poses alone. {NOT_OBSERVABLE}"
             )
-            return None
-        if camera.kind != settings.camera:
+        elif camera.kind != settings.camera:
             raise ConfigError(
                 f"camera = {settings.camera!r}, but the sensor given with the camera is of {camera.kind!r}"
             )
@@ -114,13 +117,12 @@ def align(
             both = align_both(optical, imu, camera, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
             inertial = Inertial(imu, both.brick, camera, both)
         else:
-            inertial = Inertial(
-                imu, align_times(optical, imu, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
-            )
+            alignment = align_times(optical, imu, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
+            inertial = Inertial(imu, alignment, is_hint=settings.camera != "static")
     except ShapeError as e:
         problems.append(f"the inertial samples cannot be used: {e}")
         return None
-    if inertial.alignment.reason:
+    if inertial.alignment.reason and not inertial.is_hint:
         problems.append(f"time alignment of camera and IMU: {inertial.alignment.reason}")
     if inertial.camera_alignment is not None and inertial.camera_alignment.camera.reason:
         problems.append(

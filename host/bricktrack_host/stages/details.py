@@ -13,6 +13,8 @@ def alignment_details(inertial: Inertial | None, fusion: FusionResult | None) ->
     """Return what the results say about the clocks, and what the fusion learned besides."""
     if inertial is None:
         return {"method": "none: no inertial samples were used"}
+    if inertial.is_hint:
+        return {"method": "none: the inertial samples only hint at turns and impacts"}
     alignment = inertial.alignment
     details: Details = {
         "method": "motion" if alignment.source == "data" else "stamps",

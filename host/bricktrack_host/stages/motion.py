@@ -9,6 +9,7 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_host.fusion.estimate import FusionResult, fuse
+from bricktrack_host.fusion.inertial_hint import InertialHint
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.results.daq_clock import EdgeFit
@@ -63,7 +64,7 @@ def retime(
     Splines through 30 frames a second cannot follow a motion above 15 Hz, and read-out takes 20 ms: the IMU
     knows what the brick did meanwhile.
     """
-    if inertial is None or brick.imu_lever_arm_mm is None:
+    if inertial is None or inertial.is_hint or brick.imu_lever_arm_mm is None:
         return optical
     n = len(optical.t_ns)
     for _ in range(_RETIME_PASSES):
@@ -101,7 +102,7 @@ def fuse_run(
     """Return the motion at the instants wanted: LED by LED where ``seen`` is given, else pose by pose."""
     wanted = np.concatenate(list(grid.t_ns.values()))
     fusion = None
-    if inertial is not None and brick.imu_lever_arm_mm is not None:
+    if inertial is not None and not inertial.is_hint and brick.imu_lever_arm_mm is not None:
         lever_arm_mm = brick.imu_lever_arm_mm
         try:
             if seen is None or inertial.camera is not None:
@@ -120,7 +121,8 @@ def fuse_run(
                 f"{n_rejected} optical poses disagree with the IMU and their neighbours and were left out"
             )
     else:
-        track = smooth_optical(optical, wanted)
+        hint = InertialHint(inertial.imu, inertial.alignment) if inertial and inertial.is_hint else None
+        track = smooth_optical(optical, wanted, hint=hint)
     ends = np.cumsum([len(t) for t in grid.t_ns.values()])
     parts = {
         kind: _rows(track, slice(end - len(t), end))
