@@ -11,7 +11,7 @@ from typing import Annotated
 
 import msgspec
 
-from bricktrack_common.errors import ConfigError, StorageError
+from bricktrack_common.errors import ConfigError
 from bricktrack_common.run_manifest import RUN_ID_PATTERN
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_host.durable_files import rename_durably, storage_errors, write_durably
@@ -60,22 +60,36 @@ def folder_of_test(fleet_file: Path, name: str) -> Path:
 
 
 def save_plan(folder: Path, plan: PlannedTest) -> None:
-    """Write a new plan; after return it survives a power cut.
+    """Write a new plan; after return it survives a power cut. The same plan may be written again.
 
     Raises
     ------
+    ConfigError
+        If there is another plan of this name.
     StorageError
-        If there is one already, or it cannot be written.
+        If it cannot be written.
     """
     path = folder / PLAN_NAME
     if path.exists():
-        raise StorageError(f"{path}: there is a test of this name. Choose another, or go on with this one")
+        there = load_plan(folder)
+        if there == plan:
+            return
+        raise ConfigError(
+            f"there is a test {plan.name} already, {_in_words(there)}; this one would be {_in_words(plan)}. "
+            "Choose another name"
+        )
     partial = folder / f".{PLAN_NAME}.partial"
     with storage_errors(path, "Make room"):
         folder.mkdir(parents=True, exist_ok=True)
         partial.unlink(missing_ok=True)
         write_durably(partial, dump_json(plan))
         rename_durably(partial, path)
+
+
+def _in_words(plan: PlannedTest) -> str:
+    units = plan.units if len(plan.units) <= 6 else [*plan.units[:5], f"{len(plan.units) - 5} more"]
+    length = "the units' own time" if plan.duration_s is None else f"{plan.duration_s:g} s"
+    return f"of {', '.join(units)} for {length}"
 
 
 def load_plan(folder: Path) -> PlannedTest:
@@ -90,7 +104,11 @@ def load_plan(folder: Path) -> PlannedTest:
     """
     path = folder / PLAN_NAME
     if not path.is_file():
-        raise ConfigError(f"{path}: no such test. Begin it with 'bricktrack test new {folder.name}'")
+        begun = sorted(p.parent.name for p in folder.parent.glob(f"*/{PLAN_NAME}"))
+        there = f"Tests begun here: {', '.join(begun[-10:])}. " if begun else ""
+        raise ConfigError(
+            f"{path}: no such test. {there}A new one begins with 'bricktrack test new {folder.name}'"
+        )
     return load_json(path, PlannedTest)
 
 
@@ -104,6 +122,17 @@ def is_of_test(run_id: str, name: str) -> bool:
     """
     parts = run_id.rsplit("_", 3)
     return len(parts) == 4 and parts[3] == name and parts[2].isdigit()
+
+
+def unit_of(run_id: str) -> str:
+    """Return the unit that a run's id begins with.
+
+    Examples
+    --------
+    >>> unit_of("brick_2_9f31c2_0007_shake-12")
+    'brick_2'
+    """
+    return run_id.rsplit("_", 3)[0]
 
 
 def newest(run_ids: Iterable[str]) -> str | None:

@@ -14,6 +14,7 @@ from bricktrack_host.campaign.arming_round import (
     Standing,
     close_round,
     load_round,
+    run_ids_here,
     runs_here,
     save_round,
 )
@@ -24,7 +25,6 @@ from bricktrack_host.campaign.test_plan import (
     folder_of_test,
     is_of_test,
     load_plan,
-    newest,
     save_plan,
     unit_of,
 )
@@ -93,8 +93,8 @@ def new(
     here = runs_here(_runs_folder(chosen), plan, load_round(folder))
     if here:
         raise ConfigError(
-            f"the test {name} is recorded already: {len(here)} of its runs are here. Choose another name for a "
-            f"new one; 'bricktrack test arm {name} --again' records this one once more"
+            f"the test {name} is recorded already: {len(here)} of its runs are here. Choose another name "
+            f"for a new one; 'bricktrack test arm {name} --again' records this one once more"
         )
     _look(chosen, name)
 
@@ -134,7 +134,7 @@ def arm(
     """
     plan, chosen = _planned(name, fleet, timeout)
     folder = folder_of_test(fleet_path(fleet), name)
-    looks = ask_for(chosen, lambda c: (c.client.status(), _run_ids(c)), doing="looking at")
+    looks = _look_at(chosen)
     going = _round_to_go(folder, plan, chosen, looks, again=again)
     standings = [
         look if isinstance(look, BricktrackError) else going.standing_of(u.name, *look, name)
@@ -170,12 +170,14 @@ def arm(
     if not all_armed:
         if armed and not has_run:
             say_error(
-                f"the {len(armed)} that are armed record at the first edge. 'bricktrack test arm {name}' arms "
-                "the rest; 'bricktrack disarm' calls it off"
+                f"the {len(armed)} that are armed record at the first edge. 'bricktrack test arm {name}' "
+                "arms the rest; 'bricktrack disarm' calls it off"
             )
         raise typer.Exit(EXIT_ERROR)
     if not wait:
         close_round(folder, going)
+        if not has_run:
+            out.print(f"they record at the first edge; then: bricktrack test collect {name}", markup=False)
         return
     try:
         good = wait_until_saved(
@@ -222,8 +224,9 @@ def collect(
     wanted: list[UnitConfig] = []
     run_ids: list[str] = []
     problems: list[str] = []
+    without: dict[str, list[str]] = {}
     had = runs_here(runs_folder, plan, going)
-    answers = ask_for(chosen, lambda c: (c.client.status(), _run_ids(c)), doing="asking")
+    answers = _look_at(chosen, with_runs_here=False)
     for unit, answer in zip(chosen.units, answers, strict=True):
         if isinstance(answer, BricktrackError):
             if unit.name not in had:
@@ -235,13 +238,12 @@ def collect(
             wanted.append(unit)
             run_ids.append(run_id)
         if standing.kind == "armed":
-            problems.append(
-                f"{unit.name}: is {answer[0].state} for {standing.run_id}; its run is not there yet"
-            )
+            without.setdefault(f"{answer[0].state} for {name}; no run yet", []).append(unit.name)
         elif run_id is None and unit.name not in had:
-            earlier = newest(r for r in answer[1] if is_of_test(r, name))
-            what = f"no run of {name}" if earlier is None else f"only an earlier run of {name}, {earlier}"
-            problems.append(f"{unit.name}: has {what}. Was it armed?")
+            has_earlier = any(is_of_test(r, name) for r in answer[1])
+            what = f"only an earlier run of {name}" if has_earlier else f"no run of {name}. Was it armed?"
+            without.setdefault(what, []).append(unit.name)
+    problems += [f"{some_names(units)}: {words}" for words, units in without.items()]
     if wanted:
         pulled = pull_with_bars(replace(chosen, units=wanted), runs_folder, PullSettings(run_ids=run_ids))
         problems += [f"{result.unit}: {e}" for result in pulled for e in result.errors]
@@ -292,12 +294,23 @@ def _runs_folder(chosen: ChosenUnits) -> Path:
     return chosen.fleet.runs_path
 
 
-def _run_ids(contact: Contact) -> list[str]:
-    return [run.run_id for run in contact.client.list_runs().runs]
-
-
 Look = tuple[StatusReply, list[str]]
-"""What a unit says of itself, and the runs that it has."""
+"""What a unit says of itself, and its runs."""
+
+
+def _look_at(chosen: ChosenUnits, *, with_runs_here: bool = True) -> list[Look | BricktrackError]:
+    """Ask all units how they are and which runs they have; those that are here may be deleted there."""
+    runs_folder = _runs_folder(chosen)
+
+    def look(contact: Contact) -> Look:
+        now = (
+            contact.client.status()
+        )  # first: a run that is saved in between is seen then, and not armed again
+        run_ids = [run.run_id for run in contact.client.list_runs().runs]
+        here = run_ids_here(runs_folder, contact.unit.name) if with_runs_here else []
+        return now, [*run_ids, *here]
+
+    return ask_for(chosen, look, doing="looking at")
 
 
 def _round_to_go(
@@ -333,9 +346,9 @@ def _refuse_another_shake(
     recorded = [unit for unit, kind in kinds.items() if kind == "recorded"]
     if idle and recorded:
         raise ConfigError(
-            f"{some_names(recorded)} recorded {name} already, and {some_names(idle)} did not: armed now, they "
-            f"would record another shake. 'bricktrack test collect {name}' takes what there is; 'bricktrack "
-            f"test arm {name} --again' records once more with all"
+            f"{some_names(recorded)} recorded {name} already, and {some_names(idle)} did not: armed now, "
+            f"they would record another shake. 'bricktrack test collect {name}' takes what there is; "
+            f"'bricktrack test arm {name} --again' records once more with all"
         )
 
 
