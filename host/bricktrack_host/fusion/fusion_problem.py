@@ -1,6 +1,6 @@
 """From tracks to the smoother's problem: nodes in time, noise of each step, start values and their sd."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.fusion.moving_camera import CameraMotion, imu_seconds, still_track
+from bricktrack_host.fusion.sensor_errors import SensorErrors
 from bricktrack_host.fusion.smoother import (
     ATT,
     BA,
@@ -61,6 +62,10 @@ class Run:
     camera : CameraMotion or None
         Where the camera moves: poses are then in still axes about its IMU, and gravity is its accelerometer's
         bias.
+    gyro_gain, acc_gain : ndarray, shape (3, 3)
+        Of the samples over the truth, as far as is known.
+    sensor_covariance : ndarray, shape (21, 21)
+        Of what is left in them and in the lever arm, see `sensor_errors.SensorErrors`.
     """
 
     imu: ImuTrack
@@ -75,6 +80,9 @@ class Run:
     t_mid_s: float
     span_cam_s: tuple[float, float]
     camera: CameraMotion | None = None
+    gyro_gain: FloatArray = field(default_factory=lambda: np.eye(3))
+    acc_gain: FloatArray = field(default_factory=lambda: np.eye(3))
+    sensor_covariance: FloatArray = field(default_factory=lambda: np.zeros((21, 21)))
 
     @classmethod
     def from_tracks(
@@ -127,9 +135,22 @@ class Run:
             self.imu,
             gyro_filter_s=self.alignment.gyro_filter_s,
             acc_filter_s=float(np.sqrt(max(loss_s2, 0.0))),
+            gyro_gain=self.gyro_gain,
+            acc_gain=self.acc_gain,
         )
         camera = None if self.camera is None else self.camera.with_acc_loss(loss_s2)
         return replace(self, signal=signal, camera=camera)
+
+    def with_sensor(self, errors: SensorErrors) -> "Run":
+        """Return the run with the errors of the sensor, and of its place, taken out."""
+        run = replace(
+            self,
+            lever_arm_m=self.lever_arm_m + errors.arm_m,
+            gyro_gain=(np.eye(3) + errors.gyro) @ self.gyro_gain,
+            acc_gain=(np.eye(3) + errors.acc) @ self.acc_gain,
+            sensor_covariance=errors.covariance,
+        )
+        return run.with_acc_loss(0.0)
 
     def imu_time_s(self, t_cam_s: FloatArray, lin: Linearisation) -> FloatArray:
         """Return IMU time of camera time at the linearisation point."""

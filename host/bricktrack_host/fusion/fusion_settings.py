@@ -13,7 +13,10 @@ class FusionSettings:
         White noise of one sample: BNO055 data sheet densities over its default bandwidths (0.1 deg/s and
         0.012 m/s^2), and the rounding to 1/16 deg/s and 0.01 m/s^2.
     gyro_scale_sd, acc_scale_sd : float
-        Scale and cross-axis errors left after calibration.
+        Scale and cross-axis errors left after calibration, which change with the motion.
+    sensor_gain_sd : float
+        Scale and cross-axis errors that stand still, and are estimated with the run (data sheet: 1 %; zero:
+        none).
     lever_arm_sd_mm : float
         How well the IMU's place in the brick is known.
     systematic_time_s : float
@@ -60,6 +63,7 @@ class FusionSettings:
     acc_noise_mps2: float = 0.015
     gyro_scale_sd: float = 0.004
     acc_scale_sd: float = 0.004
+    sensor_gain_sd: float = 0.01
     lever_arm_sd_mm: float = 1.0
     systematic_time_s: float = 0.1
     roughness_share: float = 1.0

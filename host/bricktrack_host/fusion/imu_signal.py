@@ -17,8 +17,8 @@ from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag
 from bricktrack_host.compiled import compiled
 from bricktrack_host.fusion.running_median import running_median
-from bricktrack_host.fusion.vibration import mend_vibration
 from bricktrack_host.fusion.signal_kernel import SignalPieces, integrate_steps
+from bricktrack_host.fusion.vibration import mend_vibration
 from bricktrack_host.tracks import ImuTrack
 
 MIN_SAMPLES = 20
@@ -197,11 +197,18 @@ class ImuSignal:
 
     @classmethod
     def from_track(
-        cls, imu: ImuTrack, *, gyro_filter_s: float = 0.0, acc_filter_s: float = 0.0
+        cls,
+        imu: ImuTrack,
+        *,
+        gyro_filter_s: float = 0.0,
+        acc_filter_s: float = 0.0,
+        gyro_gain: FloatArray | None = None,
+        acc_gain: FloatArray | None = None,
     ) -> "ImuSignal":
         """Return the signals of a track; samples that are NaN, gaps or repeats are bridged.
 
-        The low-passes of the sensors are undone, but for their delays, see `sharpened`.
+        The low-passes of the sensors are undone, but for their delays, see `sharpened`, and so are the gains
+        that the samples have over the truth, matrices of shape (3, 3).
 
         Raises
         ------
@@ -233,6 +240,10 @@ class ImuSignal:
         if np.median(shaking) > _VIBRATION_MPS2:
             mended = mend_vibration(gyro, acc, shaking)
             gyro, acc, filled_sd = mended.gyro_radps, mended.acc_mps2, mended.acc_sd_mps2
+        if gyro_gain is not None:
+            gyro = as_float_array("gyro_radps", np.linalg.solve(gyro_gain, gyro.T).T, (None, 3))
+        if acc_gain is not None:
+            acc = as_float_array("acc_mps2", np.linalg.solve(acc_gain, acc.T).T, (None, 3))
         # Steady roughness before sharpening: what that adds to noise lies high, and is gone once integrated.
         (gyro_steady, gyro_impact), (acc_steady, acc_impact) = roughness(gyro), roughness(acc)
         if gyro_filter_s > 0:

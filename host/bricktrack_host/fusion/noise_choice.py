@@ -16,6 +16,7 @@ from bricktrack_host.fusion.fusion_problem import (
     place_nodes,
 )
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.sensor_errors import estimate_sensor_errors
 from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem, residuals, score_noise
 
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
@@ -102,6 +103,7 @@ def settle_noise(
     stated = NoiseLevel(settings.roughness_share, 1.0)
     levels = [(stated, stated) for _ in runs]
     scales = [np.ones(2) for _ in runs]
+    runs, lins = _with_known_sensors(runs, lins, nodes, used, levels, settings)
     for _ in range(_MAX_SCALE_ROUNDS):
         problem, parts = build_problem(
             runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
@@ -127,6 +129,27 @@ def settle_noise(
     return Settled(runs, lins, nodes, estimate, scales, levels, both)
 
 
+def _with_known_sensors(
+    runs: list[Run],
+    lins: list[Linearisation],
+    nodes: list[Nodes],
+    used: list[BoolArray],
+    levels: list[tuple[NoiseLevel, NoiseLevel]],
+    settings: FusionSettings,
+) -> tuple[list[Run], list[Linearisation]]:
+    """Return runs without the errors of their sensors that stand still, as a first pass finds them."""
+    problem, _ = build_problem(
+        runs, nodes, lins, settings=settings, use_frame=used,
+        noise_scale=[np.ones(2) for _ in runs], levels=levels,
+    )  # fmt: skip
+    passed = Filter(problem)
+    known = []
+    for b, run in enumerate(runs):
+        errors = estimate_sensor_errors(problem, passed, b, settings)
+        known.append(run if errors is None else run.with_sensor(errors))
+    return known, lins
+
+
 def _settled_scale(scale: FloatArray, done: bool) -> FloatArray:
     """Return scales of the optical sd: below 1 only in the end, and only where that is beyond doubt."""
     less = np.maximum(scale, _LEAST_SCALE)
@@ -144,16 +167,17 @@ def _choose_noise(
     for more or less: first these, then that, then these once more. The stated level stands unless another
     earns its price.
     """
-    stated = (0, 0)  # steps of roughness, of systematic errors
+    stated = (0, 0, 0)  # steps of the accelerometer's roughness, of its systematic errors, of the gyro's
     chosen = [stated] * len(parts)
-    scores: list[dict[tuple[int, int], float]] = [{} for _ in parts]
-    last: list[dict[tuple[int, int], FloatArray]] = [{} for _ in parts]
+    scores: list[dict[tuple[int, int, int], float]] = [{} for _ in parts]
+    last: list[dict[tuple[int, int, int], FloatArray]] = [{} for _ in parts]
     for moves in (
-        [(0, 0), (0, -1), (0, -2), (0, -3), (0, -4), (0, 1), (0, 2)],
-        [(-1, 0), (-2, 0), (-3, 0)],
-        [(0, -1), (0, 1)],
+        [(0, n, n) for n in (0, -1, -2, -3, -4, 1, 2)],
+        [(0, 0, n) for n in (-2, -1, 1, 2, 3)],
+        [(-1, 0, 0), (-2, 0, 0), (-3, 0, 0), (-4, 0, 0)],
+        [(0, n, 0) for n in (-2, -1, 1, 2)],
     ):
-        tried = [[(i + di, j + dj) for di, dj in moves] for i, j in chosen]
+        tried = [[(i + di, j + dj, k + dk) for di, dj, dk in moves] for i, j, k in chosen]
         shape = (len(parts), len(moves), len(problem.dt_s))
         gyro, acc = np.zeros(shape), np.zeros(shape)
         for b, part in enumerate(parts):
@@ -163,18 +187,20 @@ def _choose_noise(
                 acc[b, n, : len(part.acc_fixed)] = part.acc(of_acc)
         log_likelihood, ends = score_noise(problem, gyro, acc)
         for b, steps in enumerate(tried):
-            for n, (i, j) in enumerate(steps):
-                if _LEAST_SYSTEMATIC <= j <= _MOST_SYSTEMATIC:
-                    scores[b][i, j] = float(log_likelihood[b, n]) - _EARN_PER_STEP * (abs(i) + abs(j))
-                    last[b][i, j] = ends[b, n]
+            for n, (i, j, k) in enumerate(steps):
+                if all(_LEAST_SYSTEMATIC <= m <= _MOST_SYSTEMATIC for m in (j, k)):
+                    price = abs(i) + max(abs(j), abs(k)) + abs(j - k)
+                    scores[b][i, j, k] = float(log_likelihood[b, n]) - _EARN_PER_STEP * price
+                    last[b][i, j, k] = ends[b, n]
         chosen = [max(score, key=score.__getitem__) for score in scores]
     return [_levels(step, settings) for step in chosen], [last[b][step] for b, step in enumerate(chosen)]
 
 
-def _levels(step: tuple[int, int], settings: FusionSettings) -> tuple[NoiseLevel, NoiseLevel]:
+def _levels(step: tuple[int, int, int], settings: FusionSettings) -> tuple[NoiseLevel, NoiseLevel]:
     """Return the levels of gyro and accelerometer, so many steps of roughness and systematic errors away."""
-    share, systematic = settings.roughness_share, _LEVEL_STEP ** step[1]
-    return NoiseLevel(share, systematic), NoiseLevel(share * _LEVEL_STEP ** step[0], systematic)
+    rough, of_acc, of_gyro = (_LEVEL_STEP**n for n in step)
+    share = settings.roughness_share
+    return NoiseLevel(share, of_gyro), NoiseLevel(share * rough, of_acc)
 
 
 def frames_log_likelihood(run: Run, settings: FusionSettings) -> float:

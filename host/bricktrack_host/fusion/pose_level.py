@@ -21,6 +21,7 @@ from bricktrack_host.fusion.fusion_problem import (
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import chain_rotations
 from bricktrack_host.fusion.noise_choice import frame_chi2, settle_noise
+from bricktrack_host.fusion.sensor_errors import with_sensor_doubt
 from bricktrack_host.fusion.smoother import (
     BA,
     BG,
@@ -104,6 +105,7 @@ def smooth_poses(runs: list[Run], settings: FusionSettings) -> list[Smoothed]:
         if is_last or not any(b.any() for b in back):
             break
         used = [u | b for u, b in zip(used, back, strict=True)]
+    estimate = with_sensor_doubt(problem, passed, estimate, [run.sensor_covariance for run in runs])
     return [
         Smoothed(run, node, lin, problem, passed, estimate, b, used[b], scales[b], levels[b], chi2[b])
         for b, (run, node, lin) in enumerate(zip(runs, nodes, lins, strict=True))

@@ -228,6 +228,7 @@ class Filter:
 
     Attributes
     ----------
+    runs : list of RunArrays
     nis : ndarray, shape (K, B)
         Innovation squared over its covariance, NaN where no frame.
     inflation : ndarray, shape (K, B)
@@ -239,7 +240,7 @@ class Filter:
     def __init__(self, problem: Problem) -> None:
         n_nodes, n_runs = problem.has_frame.shape
         self._problem = problem
-        self._runs = [_arrays_of(problem, b) for b in range(n_runs)]
+        self.runs = [_arrays_of(problem, b) for b in range(n_runs)]
         n_kept = -(-n_nodes // CHUNK)
         R, x = np.empty((n_runs, n_kept, 3, 3)), np.empty((n_runs, n_kept, N_STATES))
         P = np.empty((n_runs, n_kept, N_STATES, N_STATES))
@@ -248,7 +249,7 @@ class Filter:
         self.nis = np.full((n_runs, n_nodes), np.nan).T
         self.inflation = np.ones((n_runs, n_nodes)).T
         self.log_likelihood = np.zeros(n_runs)
-        for b, run in enumerate(self._runs):
+        for b, run in enumerate(self.runs):
             gyro_var, acc_var = self._noise_of(b)
             self.log_likelihood[b] = forward_pass(
                 run, gyro_var, acc_var, *_start_of(problem, b), self.nis.T[b], self.inflation.T[b],
@@ -277,7 +278,7 @@ class Filter:
             np.empty((len(at), N_STATES, N_STATES)),
         )
         states_before_frames(
-            self._runs[b], *self._noise_of(b), *_start_of(self._problem, b), np.asarray(at, dtype=np.int64),
+            self.runs[b], *self._noise_of(b), *_start_of(self._problem, b), np.asarray(at, dtype=np.int64),
             R, x, P,
         )  # fmt: skip
         return State(R, x), P
@@ -298,7 +299,7 @@ class Filter:
         n_leds = 0 if self._problem.leds is None else len(self._problem.leds.dt_s)
         led_residual_px, led_cov_px2 = np.empty((n_leds, 2)), np.empty((n_leds, 2, 2))
         R_before, x_before, P_before = self._before
-        for b, run in enumerate(self._runs):
+        for b, run in enumerate(self.runs):
             backward_pass(
                 run, *self._noise_of(b), R_before[b], x_before[b], P_before[b], of, is_smoothed,
                 R[b], x[b], variance[b], covariance[b], led_residual_px, led_cov_px2,
