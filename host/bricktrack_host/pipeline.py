@@ -34,6 +34,7 @@ from bricktrack_host.stages.progress import ProcessProgress, Silent, Stages
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.led_fit import with_profile_of_run
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 from bricktrack_host.tracks import OpticalTrack
 
@@ -115,6 +116,9 @@ def process_run(
     problems += pictures.problems()
     with stages("solve poses"):
         first = start_poses(observations, rays.ray_model, brick, form=settings.prsoi_form)
+        brick = with_profile_of_run(
+            observations, first, rays.ray_model, brick, rolling_shutter=settings.rolling_shutter
+        )
         observations = with_measured_noise(
             observations, first, rays.ray_model, brick, rolling_shutter=settings.rolling_shutter
         )

@@ -1,20 +1,38 @@
-"""``bricktrack calibrate leds``: what the LEDs of a type show, fitted from a recording of them."""
+"""``bricktrack calibrate leds``: what LEDs of a type show, and where they sit, fitted from a recording."""
 
+import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bricktrack_common.errors import CalibrationError, ConfigError
+
+if TYPE_CHECKING:
+    from bricktrack_common.brick_model import BrickModel
+    from bricktrack_host.tracking.led_fit import CollarFit
+    from bricktrack_host.tracking.led_positions import PositionsFit
 
 
 def leds(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run of the brick at rest in several poses.")],
     calibration: Annotated[Path, typer.Option("--calibration", "-c", help="Calibration file of the camera.")],
     layout: Annotated[
-        Path, typer.Option("--layout", "-l", help="Layout file of the brick, without a profile.")
+        Path,
+        typer.Option(
+            "--layout", "-l", help="Layout file of the brick; without a profile unless --positions is given."
+        ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Layout file to write, with the profile.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Layout file to write, with what was fitted.")
+    ],
+    positions: Annotated[
+        bool, typer.Option("--positions", help="Refine where the LEDs sit too, after their profile.")
+    ] = False,
+    tolerance_mm: Annotated[
+        float,
+        typer.Option(min=0.001, max=5.0, help="With --positions: how far off the layout may be, sd."),
+    ] = 0.2,
 ) -> None:
     """Fit the shape that LEDs of this type show, and write it into a copy of the layout file.
 
@@ -22,20 +40,29 @@ def leds(
     far depends on the lit collar under the dome. The best recording is a sweep: the brick at rest at ten or
     more places that fill the picture, near and far.
 
+    With --positions the LEDs' places are refined from the same frames. Pictures tell the pattern's shape
+    only: the first LED stays the origin, and the others as a whole are neither turned about it nor made
+    larger.
+
     For example:
 
         bricktrack calibrate leds runs/b2_sweep -c b2.json -l brick.toml -o brick-with-leds.toml
+
+        bricktrack calibrate leds runs/b2_sweep -c b2.json -l brick.toml -o brick-refined.toml --positions
     """
-    from bricktrack_common.brick_model import load_brick_model
+    from dataclasses import replace
+
+    from bricktrack_common.brick_model import ProfileEntry, load_brick_model
     from bricktrack_common.run_folder import read_run
     from bricktrack_host.calibration.calibration_file import load_calibration, require_match
     from bricktrack_host.cli._console import out
     from bricktrack_host.cli.process import stage_bar
     from bricktrack_host.pipeline import observe_run
     from bricktrack_host.tracking.led_fit import fit_collar
+    from bricktrack_host.tracking.led_positions import fit_positions
 
     brick = load_brick_model(layout)
-    if brick.led_profile is not None:
+    if brick.led_profile is not None and not positions:
         raise ConfigError(f"{layout}: has a [led_profile] already; take it out to fit another")
     rays = load_calibration(calibration)
     recording = read_run(run, verify_hashes=True)
@@ -45,27 +72,101 @@ def leds(
         observations, problems = observe_run(recording, rays.ray_model, brick, progress=bar)
     for problem in problems:
         out.print(problem, style="yellow", markup=False)
-    fit = fit_collar(observations, rays.ray_model, brick)
     simulated = " (simulated)" if recording.manifest.simulated else ""
+    text = layout.read_text(encoding="utf-8").rstrip()
+    places: PositionsFit | None = None
+    if brick.led_profile is not None:
+        places = fit_positions(observations, rays.ray_model, brick, tolerance_mm=tolerance_mm)
+    else:
+        fit = fit_collar(observations, rays.ray_model, brick)
+        if positions:
+            start = replace(brick, led_profile=ProfileEntry(collar_mm=fit.collar_mm, source="being fitted"))
+            places = fit_positions(
+                observations, rays.ray_model, start, tolerance_mm=tolerance_mm, with_collar=True
+            )
+            moved = replace(brick, led_positions_mm=places.positions_mm)
+            fit = fit_collar(observations, rays.ray_model, moved, start_mm=places.collar_mm)
+            fit = replace(fit, sd_mm=max(fit.sd_mm, places.collar_sd_mm))
+        _show_collar(fit, simulated)
+        if not fit.is_believable:
+            raise CalibrationError(
+                f"{run}: the recording does not tell the profile: left-out frames fit no better with it. "
+                "Record a sweep that fills the picture, near and far"
+            )
+        text += (
+            f"\n\n[led_profile]\ncollar_mm = {fit.collar_mm:.4f}\n"
+            f"shift_sd_per_radius = {fit.shift_sd_per_radius:.5f}\n"
+            f'source = "fitted from {recording.manifest.run_id}, {fit.n_frames} frames{simulated}, '
+            f'sd {fit.sd_mm:.3f} mm"'
+        )
+    if places is not None:
+        _show_positions(places, brick, simulated)
+        if not places.is_believable:
+            raise CalibrationError(
+                f"{run}: the recording does not better the positions: left-out frames fit no better with "
+                "them. Keep those of the layout, or record a sweep that fills the picture, near and far"
+            )
+        text = _with_positions(text, places, layout)
+    output.write_text(text + "\n", encoding="utf-8")
+    load_brick_model(output)
+    out.print(f"layout written: {output}", markup=False, soft_wrap=True)
+
+
+def _show_collar(fit: "CollarFit", simulated: str) -> None:
+    from bricktrack_host.cli._console import out
+
     out.print(
         f"collar: {fit.collar_mm:.3f} +- {fit.sd_mm:.3f} mm, from {fit.n_leds} LEDs in {fit.n_frames} "
-        f"frames{simulated}"
+        f"frames{simulated}; the light's middle is then known to {100 * fit.shift_sd_per_radius:.2f} % of "
+        "the radius"
     )
     out.print(
         f"residuals of frames left out of the fit: {fit.cross_validated_rms_px:.3f} px; "
         f"{fit.rms_without_px:.3f} px without a profile"
     )
-    if not fit.is_believable:
-        raise CalibrationError(
-            f"{run}: the recording does not tell the profile: left-out frames fit no better with it. "
-            "Record a sweep that fills the picture, near and far"
+
+
+def _show_positions(fit: "PositionsFit", brick: "BrickModel", simulated: str) -> None:
+    from rich.table import Table
+
+    from bricktrack_host.cli._console import out
+
+    table = Table(
+        title=f"LED positions from {fit.n_frames} frames{simulated}, mm: change from the layout, +- sd"
+    )
+    for name in ("LED", "x", "y", "z"):
+        table.add_column(name, justify="left" if name == "LED" else "right")
+    change = fit.positions_mm - brick.led_positions_mm
+    table.add_row(brick.led_names[0], "origin", "", "")
+    for name, moved, sd in zip(brick.led_names[1:], change[1:], fit.sd_mm[1:], strict=True):
+        table.add_row(name, *(f"{m:+.3f} +- {s:.3f}" for m, s in zip(moved, sd, strict=True)))
+    out.print(table)
+    out.print(
+        f"residuals of frames left out of the fit: {fit.cross_validated_rms_px:.3f} px; "
+        f"{fit.rms_before_px:.3f} px with the layout's positions"
+    )
+    out.print("Pictures tell neither turn nor size of the whole: both were left as in the layout.")
+
+
+def _with_positions(text: str, fit: "PositionsFit", layout: Path) -> str:
+    """Return a layout file's text with other positions in its ``[[led]]`` tables, and all else as it was."""
+    head, *tables = re.split(r"(?m)^(?=\[\[?[\w. \"]+\]\]?)", text)
+    places = iter(fit.positions_mm.tolist())
+    out, n = [head], 0
+    for table in tables:
+        if table.startswith("[[led]]"):
+            x, y, z = next(places, (0.0, 0.0, 0.0))
+            table, found = re.subn(
+                r"(?m)^(\s*position_mm\s*=\s*)\[[^\]]*\]",
+                rf"\g<1>[{x:.4f}, {y:.4f}, {z:.4f}]",
+                table,
+                count=1,
+            )
+            n += found
+        out.append(table)
+    if n != len(fit.positions_mm):
+        raise ConfigError(
+            f"{layout}: {n} of {len(fit.positions_mm)} positions found in [[led]] tables of their own; write "
+            "one table with a position_mm for each LED"
         )
-    source = (
-        f"fitted from {recording.manifest.run_id}, {fit.n_frames} frames{simulated}, sd {fit.sd_mm:.3f} mm"
-    )
-    text = layout.read_text(encoding="utf-8").rstrip()
-    output.write_text(
-        f'{text}\n\n[led_profile]\ncollar_mm = {fit.collar_mm:.4f}\nsource = "{source}"\n', encoding="utf-8"
-    )
-    load_brick_model(output)
-    out.print(f"layout with profile: {output}", markup=False, soft_wrap=True)
+    return "".join(out)

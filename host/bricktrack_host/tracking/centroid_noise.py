@@ -20,7 +20,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.first_poses import FirstPoses
-from bricktrack_host.tracking.frame_motion import led_times_ns, motion_to_leds
+from bricktrack_host.tracking.frame_motion import calm_frames, led_times_ns, motion_to_leds
 from bricktrack_host.tracking.led_profile import collar_of, predict_brick
 from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
 from bricktrack_host.tracking.refine import OWN_SHARE, LedMotion
@@ -111,7 +111,7 @@ def measure_noise(
     if rolling_shutter:
         t_ns, led_t_ns = led_times_ns(observations, ray_model)
         motion = motion_to_leds(t_ns, led_t_ns, first.R_camera_brick, first.t_camera_brick_mm)
-    frames = _quiet_frames(first, motion)
+    frames = calm_frames(first, motion, min_leds=_MIN_LEDS, at_most=_MAX_FRAMES)
     if frames.size == 0:
         return CentroidNoise(FLOOR_SD_PX, float("nan"), 0.0, 0)
     squares, stated, series = _free_residuals(frames, observations, first, motion, ray_model, brick_model)
@@ -120,17 +120,6 @@ def measure_noise(
     total = _PRIOR_DOF + dof
     mean = (_PRIOR_DOF * FLOOR_SD_PX**2 + dof * variance) / max(total - 2.0, 1.0)
     return CentroidNoise(float(np.sqrt(mean)), float(np.sqrt(variance)), float(dof), int(frames.size))
-
-
-def _quiet_frames(first: FirstPoses, motion: LedMotion | None) -> IntArray:
-    """Return frames with five LEDs whose motion within the frame is best known, at most `_MAX_FRAMES`."""
-    good = all_finite(first.R_camera_brick, 2) & (all_finite(first.uv_px).sum(axis=1) >= _MIN_LEDS)
-    frames = np.flatnonzero(good)
-    if frames.size and motion is not None and motion.twist_sd is not None:
-        doubt = motion.twist_sd[frames, 3]
-        frames = frames[doubt <= max(float(np.median(doubt)), 2 * float(doubt.min()))]
-    few = np.unique(np.linspace(0, max(frames.size - 1, 0), _MAX_FRAMES).astype(np.int64))
-    return np.asarray(frames[few] if frames.size else frames)
 
 
 def _free_residuals(

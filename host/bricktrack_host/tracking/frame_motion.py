@@ -11,7 +11,8 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.first_poses import FirstPoses
+from bricktrack_host.tracking.led_profile import collar_of, predict_brick
 from bricktrack_host.tracking.refine import LedMotion, RefinedPoses
 from bricktrack_host.tracks import FusedTrack, LedObservations
 
@@ -90,6 +91,30 @@ def motion_to_leds(
         dt_s=np.asarray((led_t_ns - t_ns[:, None]) * 1e-9, dtype=np.float64),
         twist_sd=twist_sd,
     )
+
+
+def calm_frames(first: FirstPoses, motion: LedMotion | None, *, min_leds: int, at_most: int) -> IntArray:
+    """Return frames with enough LEDs whose motion within the frame is best known, spread over the run."""
+    good = all_finite(first.R_camera_brick, 2) & (all_finite(first.uv_px).sum(axis=1) >= min_leds)
+    frames = np.flatnonzero(good)
+    if frames.size and motion is not None and motion.twist_sd is not None:
+        doubt = motion.twist_sd[frames, 3]
+        frames = frames[doubt <= max(float(np.median(doubt)), 2 * float(doubt.min()))]
+    few = np.unique(np.linspace(0, max(frames.size - 1, 0), at_most).astype(np.int64))
+    return np.asarray(frames[few] if frames.size else frames)
+
+
+def carried_px(
+    motion: LedMotion, first: FirstPoses, frames: IntArray, ray_model: RayModel, brick_model: BrickModel
+) -> FloatArray:
+    """Return how far each LED is seen from where it was at its frame's instant, (m, n_leds, 2), px."""
+    R, t_mm = first.R_camera_brick[frames], first.t_camera_brick_mm[frames]
+    R_led = R[:, None] @ matrix_from_rvec(motion.rvec_brick_rad[frames])
+    t_led_mm = t_mm[:, None] + motion.shift_camera_mm[frames]
+    collar_mm = collar_of(brick_model)
+    there, _ = predict_brick(R_led, t_led_mm, ray_model, brick_model, collar_mm=collar_mm)
+    here, _ = predict_brick(R, t_mm, ray_model, brick_model, collar_mm=collar_mm)
+    return there.uv_px - here.uv_px
 
 
 def motion_doubt_px2(

@@ -5,25 +5,33 @@ of them together: over a sweep the two come apart. Judged by cross-validation: w
 other frames, the residuals of the frames left out must shrink.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.brick_model import DEFAULT_SHIFT_SD_PER_RADIUS, BrickModel, ProfileEntry
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.first_poses import FirstPoses
+from bricktrack_host.tracking.frame_motion import calm_frames, carried_px, led_times_ns, motion_to_leds
+from bricktrack_host.tracking.led_profile import UNKNOWN_SHIFT_PER_RADIUS, predict_brick, shift_per_radius
 from bricktrack_host.tracking.led_tracker import NOT_USED
 from bricktrack_host.tracking.prsoi import prsoi_starts
-from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
+from bricktrack_host.tracking.refine import OWN_SHARE, RefinedPoses, refine_poses
 from bricktrack_host.tracks import LedObservations
 
 _MIN_LEDS = 5  # four leave two degrees of freedom, which one collar and a false pose share too easily
 _MIN_FRAMES = 5
 _N_FOLDS = 5
 _OUTLIER_SIGMAS = 4.0
+_BARELY_NEGATIVE_MM = 0.1
+_SIDE_ON_PX = 8.0  # of radius times sine; an LED seen from in front tells nothing of its shape
+OF_THE_SAME_RUN = "fitted in the run that it is used on"
+_SELF_FIT_SHIFT_SD = 0.005
+"""Of a profile that the run itself gave: views of one shake are few, and nothing else checks them."""
+_MAX_SELF_FIT_FRAMES = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +44,9 @@ class CollarFit:
     sd_mm : float
         From the residuals of frames taken as independent groups, since errors of one frame's LEDs, and of
         frames at rest, repeat.
+    shift_sd_per_radius : float
+        How far off the shape leaves the light's middle, for `ProfileEntry`: what the collar's own sd makes of
+        it, and what the LEDs show along their axes beside the fit, which no collar explains.
     rms_px : float
         Of the residuals, each of u and v, with the collar.
     cross_validated_rms_px : float
@@ -48,6 +59,7 @@ class CollarFit:
 
     collar_mm: float
     sd_mm: float
+    shift_sd_per_radius: float
     rms_px: float
     cross_validated_rms_px: float
     rms_without_px: float
@@ -107,6 +119,8 @@ def fit_collar(
     everything = np.ones(frames.size, dtype=bool)
     collar = problem.solve(everything, start_mm)
     longest = max_collar_radii * float(brick_model.led_radii_mm.max())
+    if -_BARELY_NEGATIVE_MM <= collar < 0:
+        collar = 0.0  # a bare dome whose limb is not as dark as its middle is bright
     if not 0 <= collar <= longest:
         raise CalibrationError(
             f"fitted collar is {collar:.3f} mm; expected 0 to {longest:g} mm. Check the LEDs' axes and "
@@ -123,15 +137,74 @@ def fit_collar(
         out = folds == fold
         held_out[out] = problem.poses(problem.solve(~out, collar)).residual_px[out]
     without = problem.poses(None).residual_px
+    sd = max(sd, float(1 / np.sqrt(information.sum())))
     return CollarFit(
         collar_mm=collar,
-        sd_mm=max(sd, float(1 / np.sqrt(information.sum()))),
+        sd_mm=sd,
+        shift_sd_per_radius=problem.shift_sd_per_radius(collar, sd),
         rms_px=_rms(problem.poses(collar).residual_px),
         cross_validated_rms_px=_rms(held_out),
         rms_without_px=_rms(without),
         n_frames=int(frames.size),
         n_leds=int(np.isfinite(uv[..., 0]).sum()),
     )
+
+
+def with_profile_of_run(
+    observations: LedObservations,
+    first: FirstPoses,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    rolling_shutter: bool = True,
+) -> BrickModel:
+    """Return a layout without a profile with one fitted to the run that it is used on, if the run tells one.
+
+    Domes pull all poses of a run alike, by tenths of a millimetre: what the run's own views tell of them is
+    worth more than none. The poses stay flagged `PoseFlag.LED_PROFILE_UNKNOWN`.
+
+    Parameters
+    ----------
+    observations : LedObservations
+    first : FirstPoses
+        Of the same observations.
+    ray_model : RayModel
+    brick_model : BrickModel
+        Returned as it is where it has a profile, or the run does not tell one.
+    rolling_shutter : bool
+        False: the frames are taken for instants.
+    """
+    if brick_model.led_profile is not None:
+        return brick_model
+    motion = None
+    if rolling_shutter:
+        t_ns, led_t_ns = led_times_ns(observations, ray_model)
+        motion = motion_to_leds(t_ns, led_t_ns, first.R_camera_brick, first.t_camera_brick_mm)
+    frames = calm_frames(first, motion, min_leds=_MIN_LEDS, at_most=_MAX_SELF_FIT_FRAMES)
+    uv_px = first.uv_px[frames]
+    if motion is not None and frames.size:
+        uv_px = uv_px - carried_px(motion, first, frames, ray_model, brick_model)
+    few = LedObservations(
+        sensor_timestamp_ns=observations.sensor_timestamp_ns[frames],
+        exposure_ns=observations.exposure_ns[frames],
+        uv_px=uv_px,
+        cov_px2=observations.cov_px2[frames],
+        area_px2=observations.area_px2[frames],
+        led_flags=observations.led_flags[frames],
+        frame_flags=observations.frame_flags[frames],
+    )
+    try:
+        fit = fit_collar(few, ray_model, brick_model)
+    except CalibrationError:
+        return brick_model
+    if not fit.is_believable:
+        return brick_model
+    profile = ProfileEntry(
+        collar_mm=fit.collar_mm,
+        source=OF_THE_SAME_RUN,
+        shift_sd_per_radius=max(fit.shift_sd_per_radius, _SELF_FIT_SHIFT_SD),
+    )
+    return replace(brick_model, led_profile=profile)
 
 
 def _rms(residual_px: FloatArray) -> float:
@@ -187,6 +260,26 @@ class _Problem:
         good = (ok & (seen.sum(axis=1) >= _MIN_LEDS))[:, None]
         r, d = (x - np.einsum("nij,nkj,nk->ni", Q, Q, x) for x in (r, d))
         return np.where(good, r, np.nan), np.where(good, d, np.nan)
+
+    def shift_sd_per_radius(self, collar_mm: float, sd_mm: float) -> float:
+        """Return what the shape leaves unknown; see `CollarFit`."""
+        poses = self.poses(collar_mm)
+        ok = all_finite(poses.R_camera_brick, 2)
+        R, t = poses.R_camera_brick[ok], poses.t_camera_brick_mm[ok]
+        here, _ = predict_brick(R, t, self._rays, self._brick, collar_mm=collar_mm)
+        there, _ = predict_brick(R, t, self._rays, self._brick, collar_mm=collar_mm + sd_mm)
+        per_radius = here.model_shift_px / shift_per_radius(collar_mm, self._brick)  # r sin psi, px
+        length2 = np.sum(per_radius**2, axis=-1)
+        by_collar = np.sum((there.uv_px - here.uv_px) * per_radius, axis=-1) / length2
+        beside = np.sum(poses.residual_px[ok] * per_radius, axis=-1) / length2
+        side_on = np.isfinite(beside) & (length2 > _SIDE_ON_PX**2)
+        if not side_on.any():
+            return DEFAULT_SHIFT_SD_PER_RADIUS
+        n = np.maximum(side_on.sum(axis=0), 1)
+        of_led = np.where(side_on, beside, 0.0).sum(axis=0) / n
+        own = float(np.sqrt(np.mean(of_led[side_on.any(axis=0)] ** 2))) / OWN_SHARE
+        common = float(np.sqrt(np.mean(by_collar[side_on] ** 2)))
+        return float(min(max(np.hypot(own, common), DEFAULT_SHIFT_SD_PER_RADIUS), UNKNOWN_SHIFT_PER_RADIUS))
 
     def solve(self, which: BoolArray, start_mm: float) -> float:
         """Return the collar that fits the given frames best."""

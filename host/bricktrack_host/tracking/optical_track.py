@@ -22,6 +22,7 @@ from bricktrack_host.tracking.frame_motion import (
     motion_doubt_px2,
     motion_to_leds,
 )
+from bricktrack_host.tracking.led_fit import OF_THE_SAME_RUN
 from bricktrack_host.tracking.led_identity import SegmentMethod
 from bricktrack_host.tracking.led_profile import collar_of
 from bricktrack_host.tracking.led_tracker import NOT_USED, observe_leds
@@ -219,7 +220,7 @@ def _finish(
     flags[posed & (used.sum(axis=1) == MIN_LEDS)] |= PoseFlag.UNVERIFIED
     uncovered = (used & ((observations.led_flags & LedFlag.UNCOVERED) != 0)).any(axis=1)
     flags[posed & uncovered] |= PoseFlag.UNCOVERED
-    if brick_model.led_profile is None:
+    if brick_model.led_profile is None or brick_model.led_profile.source == OF_THE_SAME_RUN:
         flags[posed] |= PoseFlag.LED_PROFILE_UNKNOWN
     gone = ~posed
     return OpticalTrack(

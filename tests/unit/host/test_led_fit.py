@@ -4,7 +4,9 @@ from led_scenes import leds_in_camera, lit_outline, polygon_centroid, random_pos
 from pinhole import PinholeCamera
 
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.tracking.led_fit import fit_collar
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.tracking.led_fit import fit_collar, with_profile_of_run
+from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()
@@ -61,3 +63,22 @@ def test_leds_that_show_something_else_are_refused():
     seen.uv_px[:] = CAMERA.project(tips).uv_px
     with pytest.raises(CalibrationError, match="expected 0 to"):
         fit_collar(seen, CAMERA, BRICK)
+
+
+def test_a_run_without_a_profile_tells_its_own():
+    seen = sweep(0.8, n=10)
+    first = start_poses(seen, CAMERA, BRICK)
+    told = with_profile_of_run(seen, first, CAMERA, BRICK, rolling_shutter=False)
+    assert told.led_profile.collar_mm == pytest.approx(0.8, abs=0.05)
+    assert told.led_profile.shift_sd_per_radius >= 0.005
+    before = solve_poses(seen, CAMERA, BRICK, first=first, rolling_shutter=False)
+    after = solve_poses(seen, CAMERA, told, first=first, rolling_shutter=False)
+    assert ((after.flags & PoseFlag.LED_PROFILE_UNKNOWN) != 0).all()
+    _, t = random_poses(10, seed=1)
+    off = [np.sqrt(np.mean((track.t_camera_brick_mm - t) ** 2)) for track in (before, after)]
+    assert off[1] < 0.3 * off[0]
+    # A layout's own profile stays, and a run that tells nothing leaves things as they were.
+    assert with_profile_of_run(seen, first, CAMERA, told, rolling_shutter=False) is told
+    few = sweep(0.8, n=3)
+    none = with_profile_of_run(few, start_poses(few, CAMERA, BRICK), CAMERA, BRICK, rolling_shutter=False)
+    assert none is BRICK

@@ -1,0 +1,77 @@
+"""``bricktrack calibrate leds`` from observations to the layout file; the pictures are another test's."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from led_scenes import random_poses
+from pinhole import PinholeCamera
+
+from bricktrack_common.brick_model import ProfileEntry, load_brick_model
+from bricktrack_common.errors import ConfigError
+from bricktrack_host import pipeline
+from bricktrack_host.calibration import calibration_file
+from bricktrack_host.cli.calibrate_leds import leds
+from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracks import LedObservations
+
+CAMERA = PinholeCamera()
+LAYOUT = Path(__file__).resolve().parents[2] / "data" / "path-traced" / "layout.toml"
+
+
+@pytest.fixture
+def sweep(monkeypatch):
+    """Thirty places of a brick whose collars are 0.8 mm long and whose m5 sits 0.3 mm too low."""
+    brick = load_brick_model(LAYOUT)
+    places = brick.led_positions_mm.copy()
+    places[5, 1] += 0.3
+    built = replace(brick, led_positions_mm=places, led_profile=ProfileEntry(collar_mm=0.8, source="test"))
+    R, t = random_poses(30, seed=1)
+    prediction, _ = predict_brick(R, t, CAMERA, built, collar_mm=0.8)
+    seen = LedObservations(
+        sensor_timestamp_ns=np.arange(30) * 33_000_000,
+        exposure_ns=np.full(30, 4_000_000),
+        uv_px=prediction.uv_px + np.random.default_rng(2).normal(0, 0.02, (30, 7, 2)),
+        cov_px2=np.broadcast_to(0.06**2 * np.eye(2), (30, 7, 2, 2)).copy(),
+        area_px2=np.full((30, 7), 3500.0),
+        led_flags=np.zeros((30, 7), dtype=np.int64),
+        frame_flags=np.zeros(30, dtype=np.int64),
+    )
+    manifest = SimpleNamespace(camera=None, simulated=True, run_id="b2_sweep")
+    monkeypatch.setattr(
+        "bricktrack_common.run_folder.read_run", lambda *_, **__: SimpleNamespace(manifest=manifest)
+    )
+    monkeypatch.setattr(calibration_file, "load_calibration", lambda _: SimpleNamespace(ray_model=CAMERA))
+    monkeypatch.setattr(pipeline, "observe_run", lambda *_, **__: (seen, []))
+
+
+def test_a_profile_and_positions_go_into_a_copy_of_the_layout(sweep, tmp_path, capsys):
+    layout, output = tmp_path / "layout.toml", tmp_path / "refined.toml"
+    text = LAYOUT.read_text(encoding="utf-8")
+    before = load_brick_model(LAYOUT)
+    if before.led_profile is not None:
+        text = text[: text.index("[led_profile]")]
+    layout.write_text(text, encoding="utf-8")
+    leds(tmp_path, tmp_path / "c.json", layout, output, positions=True)
+    after = load_brick_model(output)
+    said = capsys.readouterr().out
+    assert "simulated" in said
+    assert "neither turn nor size" in said
+    # Seen within 20 degrees of one view, a longer collar looks like LEDs that sit deeper; the sd says so.
+    sd_mm = float(re.search(r"sd ([\d.]+) mm", after.led_profile.source).group(1))
+    assert after.led_profile.collar_mm == pytest.approx(0.8, abs=3 * sd_mm)
+    assert 0.02 < sd_mm < 0.2
+    assert after.led_profile.shift_sd_per_radius < 0.01
+    assert "b2_sweep" in after.led_profile.source
+    moved = after.led_positions_mm - before.led_positions_mm
+    # Part of the 0.3 mm passes for a turn and a larger brick, which the gauge leaves with the others.
+    assert 0.2 < moved[5, 1] < 0.3
+    np.testing.assert_array_equal(after.led_positions_mm[0], 0.0)
+    np.testing.assert_array_equal(after.led_axes, before.led_axes)
+    if before.imu_lever_arm_mm is not None:
+        np.testing.assert_array_equal(after.imu_lever_arm_mm, before.imu_lever_arm_mm)
+    with pytest.raises(ConfigError, match="has a .led_profile. already"):
+        leds(tmp_path, tmp_path / "c.json", output, tmp_path / "again.toml")
