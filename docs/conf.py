@@ -26,6 +26,8 @@ myst_heading_anchors = 3
 
 # `name` in a docstring links where it can, and stays code where it cannot.
 default_role = "py:obj"
+# A name of one letter, as R or t, may be an attribute of several classes: then it stays code.
+suppress_warnings = ["ref.python"]
 autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # types, shapes and units stand in the docstrings

@@ -79,7 +79,9 @@ def test_a_test_day_with_a_simulated_unit_ends_in_a_report(tmp_path):
             os.kill(int((tmp_path / "unit.pid").read_text()), signal.SIGTERM)
         raise
     assert "1 of 1 units are ready" in outputs[5]
-    assert "Errors against simulated truth" in outputs[7]
+    assert re.search(r"(\d+) of \1 frames gave a pose", outputs[7])
+    [report] = (tmp_path / "runs").glob("*/results/report.html")
+    assert "Errors against the simulated truth" in report.read_text()
     assert (tmp_path / "stills" / "b7-1_leds.png").exists()
     assert (tmp_path / "tests" / "shake-12" / "combined" / "report.html").exists()
 
