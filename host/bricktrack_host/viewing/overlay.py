@@ -24,10 +24,14 @@ RESIDUAL: Colour = (255, 190, 90)
 INK: Colour = (240, 240, 240)
 FAINT: Colour = (150, 150, 150)
 AXES: tuple[Colour, Colour, Colour] = ((90, 130, 255), (110, 210, 110), (255, 170, 80))
+"""Of the camera's poses in the strip; the fused motion is of the same, darker."""
+_DARKER = 0.5
 
 RESIDUAL_SCALE = 100.0
 """A residual of 0.1 px is drawn 10 px long."""
-STRIP_ROWS = 240
+_WORDS_ROWS = 132
+STRIP_ROWS = _WORDS_ROWS + 228
+"""Below the picture: words, and the motion of all frames that are shown."""
 _GAIN = 255 / 219  # luma 16..235
 
 
@@ -38,31 +42,39 @@ class OverlayArtist:
     Attributes
     ----------
     result : RunResult
-    displacement_mm, angles_deg : ndarray, shape (n_frames, 3)
-        From rest where there is a rest pose, else as seen from the camera.
+    optical, fused : ndarray, shape (n_frames, 6)
+        Displacement, mm, and angles, deg, from rest where there is a rest pose, else as seen from the camera;
+        by each frame alone, and fused; NaN where not known, or extrapolated.
     height_px : int
         Of the picture; the strip with the motion comes below it.
     """
 
     result: RunResult
-    displacement_mm: FloatArray
-    angles_deg: FloatArray
+    optical: FloatArray
+    fused: FloatArray
     height_px: int
     _strip: Image
     _cursor: NDArray[np.int64]
 
     @classmethod
-    def of(cls, result: RunResult, width_px: int, height_px: int) -> "OverlayArtist":
-        """Return an artist for pictures of this size."""
-        optical = result.optical
-        R, t_mm = optical.R_camera_brick, optical.t_camera_brick_mm
-        if result.rest is not None:
-            relative = result.rest.relative(R, t_mm)
-            R, t_mm = relative.R, relative.t_mm
-        t_s = (optical.t_ns - optical.t_ns[0]) / 1e9
-        strip, cursor = _draw_strip(t_s, t_mm, width_px, from_rest=result.rest is not None)
-        angles = np.rad2deg(angles_xyz_from_matrix(R))
-        return cls(result, t_mm, angles, height_px, strip, cursor)
+    def of(
+        cls, result: RunResult, width_px: int, height_px: int, *, frames: tuple[int, int] | None = None
+    ) -> "OverlayArtist":
+        """Return an artist for pictures of this size; its strip is of ``frames``: first, after last."""
+        optical, track = result.optical, result.fused.get("frame")
+        n = len(optical.t_ns)
+        seen = _from_rest(result, optical.R_camera_brick, optical.t_camera_brick_mm)
+        fused = np.full((n, 6), np.nan)
+        if track is not None and len(track.t_ns) == n:
+            fused = _from_rest(result, track.R_camera_brick, track.t_camera_brick_mm)
+            fused[track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) != 0] = np.nan
+        t_s = (optical.t_ns - (optical.t_ns[0] if result.t0_ns is None else result.t0_ns)) / 1e9
+        first, stop = frames or (0, n)
+        strip, cursor = _draw_strip(
+            t_s, seen[:, :3], fused[:, :3], width_px, span_s=(t_s[first], t_s[stop - 1]),
+            from_rest=result.rest is not None,
+        )  # fmt: skip
+        return cls(result, seen, fused, height_px, strip, cursor)
 
     def draw(self, index: int, luma: NDArray[np.uint8] | None) -> Image:
         """Return frame ``index`` in colour, shape (height + strip, width, 3), BGR; grey where it was lost."""
@@ -73,10 +85,11 @@ class OverlayArtist:
             grey = np.clip((luma.astype(np.float32) - 16) * _GAIN, 0, 255).astype(np.uint8)
             picture = np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
         self._draw_leds(picture, index)
-        self._write_words(picture, index, lost=luma is None)
         strip = self._strip.copy()
         x = int(self._cursor[index])
-        cv2.line(strip, (x, 0), (x, STRIP_ROWS), INK, 2)
+        cv2.line(strip, (x, _WORDS_ROWS + 30), (x, STRIP_ROWS), INK, 2)
+        for row, line in enumerate(self._words(index, lost=luma is None)):
+            _write(strip, line, (16, 30 + 32 * row), INK)
         return np.asarray(np.vstack([picture, strip]), dtype=np.uint8)
 
     def _draw_leds(self, picture: Image, index: int) -> None:
@@ -91,12 +104,16 @@ class OverlayArtist:
             at = _pixel(uv)
             cv2.circle(picture, at, round(radius), USED if used else UNUSED, 2, cv2.LINE_AA)
             flags = LedFlag(int(seen.led_flags[index, i]))
-            words = name if used else f"{name}: {(flags.name or 'not used').lower().replace('|', ', ')}"
+            why = (flags.name or "not used").lower().replace("|", ", ").replace("_", " ")
+            words = name if used else f"{name}: {why}"
             _write(picture, words, (at[0] + round(radius) + 6, at[1] - 6), USED if used else UNUSED)
             if used:
-                cv2.arrowedLine(picture, _pixel(uv - RESIDUAL_SCALE * residual), at, RESIDUAL, 2, cv2.LINE_AA)
+                tail = _pixel(uv - RESIDUAL_SCALE * residual)
+                for ink, thickness in (((0, 0, 0), 5), (RESIDUAL, 2)):  # edged: lights are white
+                    cv2.arrowedLine(picture, tail, at, ink, thickness, cv2.LINE_AA)
 
-    def _write_words(self, picture: Image, index: int, *, lost: bool) -> None:
+    def _words(self, index: int, *, lost: bool) -> list[str]:
+        """Return four lines: the instant, the pose by the camera alone, the fused one, and the flags."""
         result = self.result
         t_ns = int(result.optical.t_ns[index])
         since = "" if result.t0_ns is None else f"   {(t_ns - result.t0_ns) / 1e9:+.4f} s from the trigger"
@@ -104,54 +121,74 @@ class OverlayArtist:
         if result.edge_fit is not None:
             sample = f"   sample {float(result.edge_fit.sample_index_of(t_ns)):.2f}"
         simulated = "   SIMULATED" if result.manifest.simulated else ""
-        lines = [f"{result.manifest.run_id}   frame {index}{since}{sample}{simulated}"]
         flags = int(result.optical.flags[index])
-        if lost:
-            lines.append("picture lost")
-        elif flags & PoseFlag.NO_POSE:
-            lines.append("no pose")
-        else:
-            origin = "rest" if result.rest is not None else "the camera"
-            x, y, z = self.displacement_mm[index]
-            a, b, c = self.angles_deg[index]
-            lines.append(
-                f"from {origin}   x {x:+.3f}  y {y:+.3f}  z {z:+.3f} mm   {a:+.3f}  {b:+.3f}  {c:+.3f} deg"
-            )
-        if flags:
-            lines.append(describe(flags))
-        for row, line in enumerate(lines):
-            _write(picture, line, (16, 34 + 32 * row), INK)
-        _write(picture, f"residuals x {RESIDUAL_SCALE:g}", (16, self.height_px - 18), RESIDUAL)
+        return [
+            f"{result.manifest.run_id}   frame {index}{since}{sample}{simulated}",
+            f"camera alone   {'picture lost' if lost else self._pose_words(self.optical[index])}",
+            f"fused   {self._pose_words(self.fused[index])}",
+            describe(flags & ~int(PoseFlag.NO_POSE)),
+        ]
+
+    def _pose_words(self, pose: FloatArray) -> str:
+        if not np.isfinite(pose).all():
+            return "no pose"
+        x, y, z, a, b, c = pose.tolist()
+        origin = "rest" if self.result.rest is not None else "the camera"
+        place = f"x {x:+.3f}  y {y:+.3f}  z {z:+.3f} mm   {a:+.3f}  {b:+.3f}  {c:+.3f} deg"
+        return f"{place}   from {origin}"
+
+
+def _from_rest(result: RunResult, R: FloatArray, t_mm: FloatArray) -> FloatArray:
+    if result.rest is not None:
+        relative = result.rest.relative(R, t_mm)
+        R, t_mm = relative.R, relative.t_mm
+    return np.hstack([t_mm, np.rad2deg(angles_xyz_from_matrix(R))])
 
 
 def _draw_strip(
-    t_s: FloatArray, t_mm: FloatArray, width_px: int, *, from_rest: bool
+    t_s: FloatArray,
+    optical_mm: FloatArray,
+    fused_mm: FloatArray,
+    width_px: int,
+    *,
+    span_s: tuple[float, float],
+    from_rest: bool,
 ) -> tuple[Image, NDArray[np.int64]]:
-    """Return the time histories of three displacements, and the column of each frame."""
+    """Return the histories of three displacements, fused and the camera's, and the column of each frame."""
     strip = np.full((STRIP_ROWS, width_px, 3), 24, dtype=np.uint8)
-    left, right, top, bottom = 90, width_px - 30, 34, STRIP_ROWS - 30
-    span_s = max(float(t_s[-1]), 1e-9)
-    columns = np.rint(left + t_s / span_s * (right - left)).astype(np.int64)
-    shown = t_mm if from_rest else t_mm - np.nanmedian(t_mm, axis=0)
-    known = np.asarray(np.isfinite(shown).all(axis=1))
-    limit = float(np.abs(shown[known]).max()) if known.any() else 1.0
+    left, right, top, bottom = 90, width_px - 30, _WORDS_ROWS + 34, STRIP_ROWS - 30
+    shown = (t_s >= span_s[0]) & (t_s <= span_s[1])
+    share = (t_s - span_s[0]) / max(span_s[1] - span_s[0], 1e-9)
+    columns = np.rint(left + np.clip(share, 0, 1) * (right - left)).astype(np.int64)
+    middle_mm = np.zeros(3) if from_rest else np.nanmedian(np.vstack([optical_mm, fused_mm]), axis=0)
+    curves = [(curve - middle_mm)[shown] for curve in (fused_mm, optical_mm)]
+    known = np.abs(np.vstack(curves))
+    limit = float(np.nanmax(known)) if np.isfinite(known).any() else 1.0
     limit = max(limit, 1e-3) * 1.05
-    rows = (top + bottom) / 2 - np.nan_to_num(shown) / limit * (bottom - top) / 2
     cv2.line(strip, (left, (top + bottom) // 2), (right, (top + bottom) // 2), (70, 70, 70), 1)
+    for curve, shade in zip(curves, (_DARKER, 1.0), strict=True):
+        rows = (top + bottom) / 2 - curve / limit * (bottom - top) / 2
+        for axis in range(3):
+            ink = tuple(round(shade * x) for x in AXES[axis])
+            _draw_curve(strip, columns[shown], rows[:, axis], ink)
     for axis, letter in enumerate("xyz"):
-        pieces = np.split(np.arange(len(t_s)), np.flatnonzero(np.diff(known.astype(np.int8))) + 1)
-        for piece in pieces:
-            if known[piece[0]]:
-                line = np.stack([columns[piece], np.rint(rows[piece, axis])], axis=1).astype(np.int32)
-                cv2.polylines(
-                    strip, [line], isClosed=False, color=AXES[axis], thickness=2, lineType=cv2.LINE_AA
-                )
-        _write(strip, letter, (left + 30 * axis, 24), AXES[axis])
+        _write(strip, letter, (left + 30 * axis, top - 10), AXES[axis])
     what = "displacement from rest" if from_rest else "position less its median"
-    _write(strip, f"{what}, mm, over {span_s:.2f} s", (left + 100, 24), FAINT)
+    words = f"{what}, mm, from {span_s[0]:.2f} to {span_s[1]:.2f} s; darker: fused"
+    _write(strip, words, (left + 100, top - 10), FAINT)
+    _write(strip, f"arrows: residuals x {RESIDUAL_SCALE:g}", (width_px - 330, top - 10), RESIDUAL)
     for value, row in ((limit, top), (-limit, bottom)):
         _write(strip, f"{value:+.2g}", (8, row + 8), FAINT)
     return strip, columns
+
+
+def _draw_curve(strip: Image, columns: NDArray[np.int64], rows: FloatArray, ink: tuple[int, ...]) -> None:
+    """Draw a line through what is known."""
+    known = np.isfinite(rows)
+    for piece in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(known.astype(np.int8))) + 1):
+        if len(piece) and known[piece[0]]:
+            line = np.stack([columns[piece], np.rint(rows[piece])], axis=1).astype(np.int32)
+            cv2.polylines(strip, [line], isClosed=False, color=ink, thickness=2, lineType=cv2.LINE_AA)
 
 
 def _pixel(uv: FloatArray) -> tuple[int, int]:

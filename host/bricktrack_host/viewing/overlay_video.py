@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 from av.video.frame import VideoFrame
 
-from bricktrack_common.errors import RunFormatError, VideoError
+from bricktrack_common.errors import RunFormatError
 from bricktrack_common.run_folder import read_run
 from bricktrack_host.durable_files import rename_durably, storage_errors, sync_file
 from bricktrack_host.recordings.video_frames import decode_run_video
 from bricktrack_host.results.result_store import read_result
 from bricktrack_host.viewing.overlay import STRIP_ROWS, Image, OverlayArtist
+from bricktrack_host.viewing.run_scene import video_of
 
 _TIME_BASE = Fraction(1, 1_000_000)
 _RATE = 30
@@ -55,16 +56,12 @@ def write_overlay(
     """
     run = read_run(run_folder)
     result = read_result(results_folder)
-    if run.video is None or run.frames is None or run.manifest.camera is None:
-        raise VideoError(f"{run_folder}: the run has no video with frame times; there is nothing to draw on")
-    if result.manifest.run_id != run.manifest.run_id or len(result.optical.t_ns) != run.frames.n_frames:
-        raise RunFormatError(f"{results_folder}: results of {result.manifest.run_id}, not of this run")
-    first, stop = frames or (0, run.frames.n_frames)
-    stop = min(stop, run.frames.n_frames)
+    video, stamps, mode = video_of(run, result)
+    first, stop = frames or (0, stamps.n_frames)
+    stop = min(stop, stamps.n_frames)
     if not 0 <= first < stop:
-        raise RunFormatError(f"frames {first} to {stop}: the run has frames 0 to {run.frames.n_frames - 1}")
-    mode = run.manifest.camera.mode
-    artist = OverlayArtist.of(result, mode.width, mode.height)
+        raise RunFormatError(f"frames {first} to {stop}: the run has frames 0 to {stamps.n_frames - 1}")
+    artist = OverlayArtist.of(result, mode.width, mode.height, frames=(first, stop))
     partial = output.with_name(f".{output.name}.partial")
     n = 0
     with storage_errors(output, "Choose another --output, or make room"):
@@ -77,8 +74,8 @@ def write_overlay(
                 stream.width = int(mode.width * scale) // 2 * 2
                 stream.height = int((mode.height + STRIP_ROWS) * scale) // 2 * 2
                 stream.time_base = stream.codec_context.time_base = _TIME_BASE
-                t0_ns = int(run.frames.sensor_timestamp_ns[first])
-                for frame in decode_run_video(run.video, run.frames):
+                t0_ns = int(stamps.sensor_timestamp_ns[first])
+                for frame in decode_run_video(video, stamps):
                     if frame.index >= stop:
                         break
                     if frame.index < first:

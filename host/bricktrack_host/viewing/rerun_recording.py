@@ -75,7 +75,7 @@ def record_run(
     VideoError, RunFormatError
         If the run has no video, or the results are of another run.
     """
-    video, frames = video_of(run, result)
+    video, frames, _ = video_of(run, result)
     say = progress or (lambda _what, _done, _of: None)
     recorder = _Recorder(stream, result)
     parts: list[tuple[str, Callable[[], None]]] = [

@@ -11,7 +11,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
-from bricktrack_common.camera_model import RayModel
+from bricktrack_common.camera_model import RayModel, SensorMode
 from bricktrack_common.errors import RunFormatError, VideoError
 from bricktrack_common.frame_times import FrameTimes
 from bricktrack_common.run_folder import Run
@@ -104,8 +104,8 @@ class Pinhole:
     principal_px: tuple[float, float]
 
 
-def video_of(run: Run, result: RunResult) -> tuple[Path, FrameTimes]:
-    """Return the video of a run, whose results these are, and its frame times.
+def video_of(run: Run, result: RunResult) -> tuple[Path, FrameTimes, SensorMode]:
+    """Return the video of a run, whose results these are, its frame times and its camera's mode.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def video_of(run: Run, result: RunResult) -> tuple[Path, FrameTimes]:
         raise VideoError(f"{run.folder}: the run has no video with frame times; there is nothing to see")
     if result.manifest.run_id != run.manifest.run_id or len(result.optical.t_ns) != run.frames.n_frames:
         raise RunFormatError(f"{run.folder}: these are results of {result.manifest.run_id}, not of this run")
-    return run.video, run.frames
+    return run.video, run.frames, run.manifest.camera.mode
 
 
 def origin_ns(result: RunResult) -> tuple[int, str]:

@@ -79,10 +79,36 @@ def test_the_cursor_moves_with_time_not_with_the_frames_number(result, artist):
     assert columns[2] - columns[1] == pytest.approx(3 * (columns[1] - columns[0]) / 120, abs=1.5)
 
 
-def test_no_rest_is_said(result, monkeypatch):
+def words_of(artist, index, picture, monkeypatch):
     words = []
-    artist = OverlayArtist.of(replace(result, rest=None), WIDTH, HEIGHT)
     monkeypatch.setattr(drawing, "_write", lambda picture, text, at, colour: words.append(text))
-    artist.draw(3, BLACK)
+    artist.draw(index, picture)
+    return words
+
+
+def test_a_dropout_shows_what_is_known_without_the_camera(result, artist, monkeypatch):
+    hidden = int(np.flatnonzero(np.isnan(result.optical.t_camera_brick_mm[:, 0]))[3])
+    words = words_of(artist, hidden, BLACK, monkeypatch)
+    assert "camera alone   no pose" in words
+    fused = next(text for text in words if text.startswith("fused"))
+    x_mm = float(fused.split("x ")[1].split()[0])
+    moved = result.rest.relative(
+        result.fused["frame"].R_camera_brick[[hidden]], result.fused["frame"].t_camera_brick_mm[[hidden]]
+    )
+    assert x_mm == pytest.approx(moved.t_mm[0, 0], abs=6e-4)  # three decimals
+
+
+def test_the_strip_of_chosen_frames_spans_them_alone(result):
+    artist = OverlayArtist.of(result, WIDTH, HEIGHT, frames=(200, 260))
+    assert (artist._cursor[200], artist._cursor[259]) == (90, WIDTH - 30)
+    assert np.ptp(artist._cursor[:200]) == 0
+    # Drawn to the scale of these frames: a curve comes near the upper or the lower end.
+    plot = artist._strip[drawing._WORDS_ROWS + 34 : -30].astype(int)
+    rows = np.concatenate([np.nonzero(np.abs(plot - ink).max(axis=2) < 12)[0] for ink in drawing.AXES])
+    assert min(rows.min(), len(plot) - 1 - rows.max()) < 12
+
+
+def test_no_rest_is_said(result, monkeypatch):
+    words = words_of(OverlayArtist.of(replace(result, rest=None), WIDTH, HEIGHT), 3, BLACK, monkeypatch)
     assert any("from the camera" in text for text in words)
     assert any("SIMULATED" in text for text in words)
