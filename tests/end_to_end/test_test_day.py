@@ -21,6 +21,7 @@ from bricktrack_host.assemblies.combined_test import read_test
 from bricktrack_host.cli import test_day
 from bricktrack_host.cli.main import app
 from bricktrack_host.results.result_store import write_results
+from bricktrack_host.transfer.unit_client import UnitClient
 
 ROOT = Path(__file__).parents[2]
 spec = importlib.util.spec_from_file_location("example_report", ROOT / "scripts" / "example_report.py")
@@ -63,7 +64,7 @@ def test_a_shake_from_the_look_before_it_to_the_report(lab, tmp_path):
     code, words = invoke("new", "shake-12")
     assert (code, "3 of 3 units are ready" in words) == (0, True), words
     arming = start("arm", "shake-12", cwd=tmp_path)
-    assert "b7-1: run b7-1" in arming.stdout.readline()
+    assert "b7-1: armed, run b7-1" in arming.stdout.readline()
     while "3 of 3 units" not in arming.stdout.readline():
         pass
     lab.trigger(20_000)
@@ -83,15 +84,19 @@ def test_a_shake_from_the_look_before_it_to_the_report(lab, tmp_path):
 
     code, words = invoke("arm", "shake-12")
     assert code == 0, "what is recorded is not recorded again unasked"
+    assert "nothing was armed: shake-12 is recorded" in words
     assert all(re.search(rf"{name}: \S*_0001_shake-12 complete", words) for name in NAMES)
 
 
 def test_a_host_killed_at_every_step_loses_nothing_and_goes_on(lab, tmp_path):
     draw = random.Random(3)
     assert invoke("new", "s1")[0] == 0
-    code, words = invoke("new", "s1")
-    assert code != 0
-    assert "there is a test of this name" in words
+    assert invoke("new", "s1")[0] == 0, "begun again, as after a kill"
+    code, words = invoke("new", "s1", "--duration", "9")
+    assert code == 1
+    assert (
+        "there is a test s1 already, of b7-1, b7-2, b8-1 for the units' own time; this one would be" in words
+    )
 
     for _ in range(3):  # while arming and waiting
         arming = start("arm", "s1", cwd=tmp_path)
@@ -143,6 +148,81 @@ def test_a_unit_that_is_gone_stops_nobody(lab, tmp_path):
     assert code == 1
     assert "without b8-1: not here, or not processed" in words
     assert len(read_test(tmp_path / "tests" / "s2" / "combined").units) == 2
+
+
+def test_who_does_not_arm_is_named_and_the_rest_record(lab, tmp_path, monkeypatch):
+    arm = UnitClient.arm
+    monkeypatch.setattr(UnitClient, "arm", lambda *words, **options: arm(*words, **options, timeout_s=1.0))
+    (tmp_path / "cards" / "b7-2" / "full").touch()
+    (tmp_path / "cards" / "b8-1" / "mute").touch()
+    assert invoke("new", "s3")[0] == 0
+    code, words = invoke("arm", "s3")
+    assert code == 1
+    assert "1 of 3 units armed" in words
+    assert re.search("b7-2: .* refused arm: 0.3 GB free; a run needs 1.2 GB", words)
+    assert "not armed: b7-2, b8-1" in words
+    assert "the 1 that are armed record at the first edge. 'bricktrack test arm s3' arms the rest" in words
+
+    code, words = invoke("arm", "s3", "--no-wait")
+    assert code == 1
+    assert "b8-1: armed, run b8-1" in words, "it had armed, and its word was lost"
+    assert "_0001_s3" in words and "_0002_s3" not in words
+    assert "not armed: b7-2" in words
+    (tmp_path / "cards" / "b7-2" / "full").unlink()
+    code, words = invoke("arm", "s3", "--no-wait")
+    assert (code, "they record at the first edge" in words) == (0, True), words
+    code, words = invoke("collect", "s3")
+    assert code == 1
+    assert "b7-1, b7-2, b8-1: armed for s3; no run yet" in words
+
+
+def test_nobody_is_armed_for_a_shake_that_others_recorded_already(lab, tmp_path):
+    (tmp_path / "cards" / "b7-2" / "full").touch()
+    assert invoke("new", "s4")[0] == 0
+    assert invoke("arm", "s4", "--no-wait")[0] == 1
+    lab.trigger(10_000)
+    (tmp_path / "cards" / "b7-2" / "full").unlink()
+    code, words = invoke("arm", "s4")
+    assert code == 1
+    assert (
+        "b7-1, b8-1 recorded s4 already, and b7-2 did not: armed now, they would record another shake"
+        in words
+    )
+    code, words = invoke("collect", "s4")
+    assert (code, "b7-2: no run of s4. Was it armed?" in words) == (1, True)
+
+    assert invoke("arm", "s4", "--again", "--no-wait")[0] == 0
+    code, words = invoke("collect", "s4")
+    assert (code, "0 of 3 runs are here" in words) == (1, True), "no run of the shake before"
+    lab.trigger(10_000)
+    assert invoke("collect", "s4")[0] == 0
+    code, words = invoke("report", "s4")
+    assert code == 0
+    used = {u.unit: u.run_id for u in read_test(tmp_path / "tests" / "s4" / "combined").units}
+    assert [used[name].rsplit("_", 2)[1] for name in NAMES] == ["0002", "0001", "0002"]
+    code, words = invoke("new", "s4")
+    assert (code, "the test s4 is recorded already: 3 of its runs are here" in words) == (1, True)
+
+
+def test_recording_once_more_resumes_after_a_kill(lab, tmp_path):
+    assert invoke("new", "s5")[0] == 0
+    assert invoke("arm", "s5", "--no-wait")[0] == 0
+    lab.trigger(10_000)
+    arming = start("arm", "s5", "--again", cwd=tmp_path)
+    while "3 of 3 units" not in arming.stdout.readline():
+        pass
+    arming.kill()
+    arming.communicate()
+    lab.trigger(10_000)
+    code, words = invoke("arm", "s5", "--again")
+    assert code == 0
+    assert "nothing was armed: s5 is recorded" in words, "by the round that was cut short"
+    assert all(f"{name}: has run" in words for name in NAMES)
+    assert "_0002_s5 complete" in words
+    assert invoke("arm", "s5", "--again", "--no-wait")[0] == 0
+    lab.trigger(10_000)
+    cards = [sorted((tmp_path / "cards" / name / "runs").iterdir()) for name in NAMES]
+    assert [len(runs) for runs in cards] == [3, 3, 3]
 
 
 def test_a_name_that_cannot_be_a_label_is_refused(lab):

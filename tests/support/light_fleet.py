@@ -38,7 +38,10 @@ from bricktrack_device.unit_service import UnitService
 
 
 class StateOnly:
-    """A recorder without sensors; what it records is made up when it is told to."""
+    """A recorder without sensors; what it records is made up when it is told to.
+
+    A file ``full`` in its storage makes it refuse to arm; ``mute`` makes it arm and not say so.
+    """
 
     def __init__(self, store: RunStore) -> None:
         self.state = "idle"
@@ -48,7 +51,12 @@ class StateOnly:
     def arm(self, label, duration_s, answer) -> None:
         if self.state != "idle":
             raise RequestRefusedError("wrong-state", f"the unit is {self.state} for {self.run_id}")
+        storage = self._store.runs.parent
+        if (storage / "full").exists():
+            raise RequestRefusedError("no-space", "0.3 GB free; a run needs 1.2 GB")
         self.state, self.run_id = "armed", self._store.new_run_id(label)
+        if (storage / "mute").exists():
+            return
         answer(Armed(run_id=self.run_id, missing=[]))
 
     def disarm(self, answer) -> None:

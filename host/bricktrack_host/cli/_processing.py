@@ -224,7 +224,7 @@ def _process(todo: "list[tuple[RunJob, str]]", where: Where) -> int:
                 if everything is not None:
                     progress.advance(everything)
                 if outcome.value is not None:
-                    say_summary(outcome.value, budget=False)
+                    say_summary(outcome.value, budget=len(todo) == 1)
                     continue
                 n_failed += 1
                 if outcome.is_bug:
