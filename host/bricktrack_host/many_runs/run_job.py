@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from bricktrack_host.many_runs.one_at_a_time import alone_with
 from bricktrack_host.many_runs.processing_record import (
     ProcessingRecord,
     Stopwatch,
@@ -104,16 +105,19 @@ def process_job(job: RunJob, input_sha256: str, progress: RunProgress) -> RunSum
 
     Raises
     ------
+    ConfigError
+        If another command is at it.
     BricktrackError
         As `pipeline.process_run`.
     """
     watch = Stopwatch()
-    processed = process_run(
-        job.run, calibration=job.calibration, layout=job.layout, output=job.output, settings=job.settings,
-        truth=job.truth, progress=progress,
-    )  # fmt: skip
-    took = watch.read()
-    write_record(processed.folder, ProcessingRecord(input_sha256=input_sha256, took=took))
+    with alone_with(job.run):
+        processed = process_run(
+            job.run, calibration=job.calibration, layout=job.layout, output=job.output, settings=job.settings,
+            truth=job.truth, progress=progress,
+        )  # fmt: skip
+        took = watch.read()
+        write_record(processed.folder, ProcessingRecord(input_sha256=input_sha256, took=took))
     return replace(summarise(processed), took=took)
 
 

@@ -16,6 +16,7 @@ from bricktrack_common.errors import BricktrackError, ConfigError, TransferError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_common.typed_data import dump_json
 from bricktrack_host.durable_files import storage_errors, write_folder_whole
+from bricktrack_host.many_runs.one_at_a_time import alone_with
 from bricktrack_host.many_runs.processing_record import RECORD_NAME, ProcessingRecord, Stopwatch
 from bricktrack_host.many_runs.run_job import RunJob, RunSummary, summarise
 from bricktrack_host.many_runs.software_identity import Identity, differences, identity
@@ -187,6 +188,8 @@ def publish(job: RunJob, input_sha256: str, returned: Returned) -> RunSummary:
     ------
     TransferError
         If it is not what the worker sent.
+    ConfigError
+        If another command is at this run.
     StorageError
         If it cannot be written.
     """
@@ -201,7 +204,11 @@ def publish(job: RunJob, input_sha256: str, returned: Returned) -> RunSummary:
         for name, data in files.items():
             (partial / name).write_bytes(data)
 
-    earlier = write_folder_whole(
-        job.results, write, marker=SUMMARY_NAME, keep_if=lambda new, old: results_id(new) != results_id(old)
-    )
+    with alone_with(job.run):
+        earlier = write_folder_whole(
+            job.results,
+            write,
+            marker=SUMMARY_NAME,
+            keep_if=lambda new, old: results_id(new) != results_id(old),
+        )
     return replace(returned.summary, folder=job.results, report=job.results / REPORT_NAME, earlier=earlier)
