@@ -23,6 +23,44 @@ BRICK = AssemblyConfig(
     ],
 )
 
+FLEET = """
+[[unit]]
+name = "b7-1"
+address = "tcp://127.0.0.1:1001"
+
+[[unit]]
+name = "b7-2"
+address = "tcp://127.0.0.1:1002"
+
+[[assembly]]
+name = "brick-7"
+kind = "TCB"
+base = "A"
+
+[[assembly.component]]
+name = "A"
+
+[[assembly.component]]
+name = "B"
+
+[[assembly.component]]
+name = "C"
+point_mm = [0.0, 0.0, 60.0]
+
+[[assembly.view]]
+unit = "b7-1"
+camera_on = "A"
+leds_on = "B"
+position_brick_layout_mm = [10.0, 20.0, 30.0]
+
+[[assembly.view]]
+unit = "b7-2"
+camera_on = "B"
+leds_on = "C"
+position_brick_layout_mm = [-10.0, 20.0, 30.0]
+"""
+"""The same brick in a fleet file."""
+
 
 def _example() -> ModuleType:
     path = Path(__file__).parents[2] / "scripts" / "example_report.py"

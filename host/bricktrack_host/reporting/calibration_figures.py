@@ -16,7 +16,8 @@ from bricktrack_host.calibration.dot_data import Planes
 from bricktrack_host.calibration.picture_region import ConvexRegion
 from bricktrack_host.calibration.pixel_polynomials import picture_grid
 from bricktrack_host.calibration.ray_uncertainty import CHI_95, UncertainRays
-from bricktrack_host.reporting.figure_layout import WIDTH_IN, panel_grid, picture_axes
+from bricktrack_host.reporting.figure_layout import panel_row, picture_axes
+from bricktrack_host.reporting.page_measures import WIDTH_IN
 from bricktrack_host.reporting.plots import FUSED, IMPACT, INK, OPTICAL, TRUTH
 
 COLOURS = "viridis"
@@ -129,14 +130,15 @@ def uncertainty_figure(
     u, v = uv[:columns, 0], uv[::columns, 1]
     box_in = (WIDTH_IN - 0.9 - _COLOUR_BAR_IN - 0.5 * (len(depths_mm) - 1)) / len(depths_mm)
     height_in = box_in * mode.height / mode.width + 0.7
-    fig, axes = panel_grid(1, len(depths_mm), height_in=height_in, titles=True, labelled_columns=False,
-                           width_in=WIDTH_IN - _COLOUR_BAR_IN)  # fmt: skip
+    fig, axes = panel_row(
+        len(depths_mm), height_in=height_in, width_in=WIDTH_IN - _COLOUR_BAR_IN, labelled_columns=False
+    )
     maps = [1e3 * CHI_95 * _longest_axis(model.point_covariance_mm2(uv, z)) for z in depths_mm]
     # Corners without dots are worse by orders of magnitude: steps that grow show them and the middle.
     every = np.concatenate(maps)
     low = max(float(every.min()), 1e-3)
     levels = np.geomspace(low, max(float(np.quantile(every, 0.97)), 1.5 * low), 13)
-    for ax, z_mm, size in zip(axes[0], depths_mm, maps, strict=True):
+    for ax, z_mm, size in zip(axes, depths_mm, maps, strict=True):
         filled = ax.contourf(u, v, size.reshape(rows, columns), levels=levels, cmap=COLOURS, extend="both",
                               norm=LogNorm(levels[0], levels[-1]))  # fmt: skip
         for region in covered:
@@ -152,7 +154,7 @@ def uncertainty_figure(
         ax.set_title(f"z = {z_mm:.1f} mm{words}")
         ax.set(xlim=(-0.5, mode.width - 0.5), ylim=(mode.height - 0.5, -0.5), xlabel="u, px")
         ax.grid(visible=False)
-    axes[0, 0].set_ylabel("v, px")
+    axes[0].set_ylabel("v, px")
     _colour_bar(fig, filled, "95 % half-axis, um", form="%.2g")
     return fig
 
@@ -160,10 +162,10 @@ def uncertainty_figure(
 def comparison_figure(comparison: CalibrationComparison, mode: SensorMode) -> Figure:
     """Return how rays moved since an earlier calibration, as they are and less the camera's motion."""
     box_in = (WIDTH_IN - 1.7) / 2
-    fig, axes = panel_grid(1, 2, height_in=box_in * mode.height / mode.width + 0.7, titles=True)
+    fig, axes = panel_row(2, height_in=box_in * mode.height / mode.width + 0.7)
     every = np.s_[:: max(len(comparison.uv_px) // 500, 1)]
     for ax, moved, words in zip(
-        axes[0], (comparison.moved_mm, comparison.left_mm), ("as they are", "less a motion of the camera"),
+        axes, (comparison.moved_mm, comparison.left_mm), ("as they are", "less a motion of the camera"),
         strict=True,
     ):  # fmt: skip
         size = 1e3 * np.hypot(*moved.T)
@@ -181,8 +183,7 @@ def _plane_panels(planes: Planes) -> tuple[Figure, list[Axes]]:
     span = np.ptp(np.concatenate([seen.xy_mm for _, seen in planes]), axis=0)
     box_in = (WIDTH_IN - 0.9 - _COLOUR_BAR_IN - 0.82 * (n - 1)) / n
     height_in = float(np.clip(box_in * span[1] / max(span[0], 1e-9), 1.2, 6.0)) + 0.72
-    fig, axes = panel_grid(1, n, height_in=height_in, titles=True, width_in=WIDTH_IN - _COLOUR_BAR_IN)
-    return fig, list(axes[0])
+    return panel_row(n, height_in=height_in, width_in=WIDTH_IN - _COLOUR_BAR_IN)
 
 
 def _plane_labels(ax: Axes) -> None:

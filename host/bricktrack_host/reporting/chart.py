@@ -14,6 +14,20 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.reporting.chart_marks import UNITS_PER_PT, Area, Mark, Spans, text, units
 from bricktrack_host.reporting.chart_ticks import Ticks, linear_ticks, log_ticks
+from bricktrack_host.reporting.page_measures import (
+    BARE_GAP_IN,
+    BOTTOM_IN,
+    GAP_IN,
+    LEFT_IN,
+    LEGEND_IN,
+    PICTURE_WIDTH_IN,
+    RIGHT_IN,
+    TICK_LABELS_IN,
+    TITLE_IN,
+    TOP_IN,
+    WIDTH_IN,
+    Y_LABEL_IN,
+)
 
 INK = "#22272e"
 SOFT = "#5b616b"
@@ -22,14 +36,6 @@ _EDGE = "#8a8f98"
 _FONT = "DejaVu Sans,Verdana,Helvetica,Arial,sans-serif"
 _EM_SHARE = 0.56  # mean width of a letter of such fonts
 
-WIDTH_IN = 10.4
-_LEFT_IN = 0.74  # "-0.025", a label across it, and a gap between them
-_RIGHT_IN = 0.08
-_BOTTOM_IN = 0.42
-_LEGEND_IN = 0.27
-_TITLE_IN = 0.21
-_GAP_IN = 0.13
-_TICK_LABELS_IN = 0.20
 _PT = 72.0  # an inch
 _SWATCH_PT = 16.0
 _X_MARGIN, _Y_MARGIN = 0.01, 0.05
@@ -124,19 +130,19 @@ def panel_grid(
     heights : tuple of float, optional
         Of the rows, relative.
     """
-    title_in = _TITLE_IN if titles else 0.0
-    top_in = (_LEGEND_IN if legend else 0.0) + (title_in or 0.06)
-    gap_y_in = title_in + (_GAP_IN if share_x == "all" else _GAP_IN + _TICK_LABELS_IN)
-    gap_x_in = _LEFT_IN + 0.06 if labelled_columns else 0.5
-    box_width_in = (WIDTH_IN - _LEFT_IN - _RIGHT_IN - (columns - 1) * gap_x_in) / columns
+    title_in = TITLE_IN if titles else 0.0
+    top_in = (LEGEND_IN if legend else 0.0) + (title_in or TOP_IN)
+    gap_y_in = title_in + (GAP_IN if share_x == "all" else GAP_IN + TICK_LABELS_IN)
+    gap_x_in = LEFT_IN + TOP_IN if labelled_columns else BARE_GAP_IN
+    box_width_in = (WIDTH_IN - LEFT_IN - RIGHT_IN - (columns - 1) * gap_x_in) / columns
     shares = np.ones(rows) if heights is None else np.asarray(heights)
-    box_heights_in = (height_in - top_in - _BOTTOM_IN - (rows - 1) * gap_y_in) * shares / shares.sum()
+    box_heights_in = (height_in - top_in - BOTTOM_IN - (rows - 1) * gap_y_in) * shares / shares.sum()
     panels, at_in = [], top_in
     for i, box_height_in in enumerate(box_heights_in.tolist()):
         panels.append(
             [
                 Panel(
-                    _PT * (_LEFT_IN + k * (box_width_in + gap_x_in)),
+                    _PT * (LEFT_IN + k * (box_width_in + gap_x_in)),
                     _PT * at_in,
                     _PT * box_width_in,
                     _PT * box_height_in,
@@ -151,16 +157,18 @@ def panel_grid(
 
 def picture_chart(width_px: int, height_px: int, *, legend: bool = False) -> tuple[Chart, Panel]:
     """Return a chart over a picture, in pixels, v downwards, both to one scale."""
-    box_width_in = 6.6 - _LEFT_IN - _RIGHT_IN
+    box_width_in = PICTURE_WIDTH_IN - LEFT_IN - RIGHT_IN
     box_height_in = box_width_in * height_px / width_px
-    top_in = _TITLE_IN + 0.06
+    top_in = TITLE_IN + TOP_IN
     panel = Panel(
-        _PT * _LEFT_IN, _PT * top_in, _PT * box_width_in, _PT * box_height_in,
+        _PT * LEFT_IN, _PT * top_in, _PT * box_width_in, _PT * box_height_in,
         x_label="u, px", y_label="v, px", x_limits=(-0.5, width_px - 0.5), y_limits=(height_px - 0.5, -0.5),
         framed=True,
     )  # fmt: skip
-    height_in = top_in + box_height_in + _BOTTOM_IN + (_LEGEND_IN if legend else 0.0)
-    return Chart(_PT * 6.6, _PT * height_in, [[panel]], legend="below" if legend else "none"), panel
+    height_in = top_in + box_height_in + BOTTOM_IN + (LEGEND_IN if legend else 0.0)
+    return Chart(
+        _PT * PICTURE_WIDTH_IN, _PT * height_in, [[panel]], legend="below" if legend else "none"
+    ), panel
 
 
 def _limits_of(group: list[Panel]) -> tuple[float, float]:
@@ -253,7 +261,7 @@ def _panel_svg(panel: Panel, x_limits: tuple[float, float], number: int) -> str:
     if panel.x_label:
         parts.append(text(middle_x, bottom + units(25.5), panel.x_label, colour=INK, anchor="middle"))
     if panel.y_label:
-        at = left - units(0.58 * _PT - 3)
+        at = left - units(Y_LABEL_IN * _PT - 3)
         parts.append(text(at, middle_y, panel.y_label, colour=INK, anchor="middle", upwards=True))
     if panel.title:
         parts.append(text(left, top - units(5), panel.title, colour=INK, size_pt=9, bold=True))

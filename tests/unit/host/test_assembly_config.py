@@ -1,47 +1,13 @@
 """Assemblies in a fleet file: what is refused, and with which words."""
 
 import pytest
+from small_lab import FLEET
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.transfer.fleet_config import load_fleet
 
-FLEET = """
-[[unit]]
-name = "b7-1"
-address = "tcp://127.0.0.1:1001"
-
-[[unit]]
-name = "b7-2"
-address = "tcp://127.0.0.1:1002"
-
-[[assembly]]
-name = "brick-7"
-kind = "TCB"
-base = "A"
-
-[[assembly.component]]
-name = "A"
-
-[[assembly.component]]
-name = "B"
-point_mm = [0.0, 0.0, 60.0]
-
-[[assembly.component]]
-name = "C"
-
-[[assembly.view]]
-unit = "b7-1"
-camera_on = "A"
-leds_on = "B"
-position_brick_layout_mm = [10.0, 20.0, 30.0]
-
-[[assembly.view]]
-unit = "b7-2"
-camera_on = "C"
-leds_on = "B"
-position_brick_layout_mm = [-10.0, 20.0, 30.0]
-rotation_brick_layout = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-"""
+# A quarter turn about z takes the layout's x axis to the brick's y axis.
+TURNED = FLEET + "rotation_brick_layout = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]\n"
 
 
 def load(tmp_path, text):
@@ -51,9 +17,8 @@ def load(tmp_path, text):
 
 
 def test_a_triply_cracked_brick_is_read(tmp_path):
-    [assembly] = load(tmp_path, FLEET).assembly
+    [assembly] = load(tmp_path, TURNED).assembly
     assert [c.name for c in assembly.component] == ["A", "B", "C"]
-    # A quarter turn about z takes the layout's x axis to the brick's y axis.
     assert assembly.view[1].pose_brick_layout.apply([1.0, 0.0, 0.0]).tolist() == [-10.0, 21.0, 30.0]
 
 
@@ -64,14 +29,14 @@ def test_a_triply_cracked_brick_is_read(tmp_path):
         ('base = "A"', 'base = "X"', "no component 'X'"),
         ('unit = "b7-2"', 'unit = "b9"', "no unit 'b9' in the fleet"),
         ('unit = "b7-2"', 'unit = "b7-1"', "'b7-1' stands twice"),
-        ('camera_on = "C"', 'camera_on = "B"', "camera and LEDs are both on 'B'"),
-        ('camera_on = "C"', 'camera_on = "A"', "no chain of views leads from the base 'A' to C"),
+        ('leds_on = "C"', 'leds_on = "B"', "camera and LEDs are both on 'B'"),
+        ('leds_on = "C"', 'leds_on = "A"', "no chain of views leads from the base 'A' to C"),
         ("[0.0, 0.0, 1.0]]", "[0.0, 0.0, 2.0]]", "rotation_brick_layout: not a rotation"),
         ("[0.0, 0.0, 1.0]]", "[0.0, 0.0, -1.0]]", "rotation_brick_layout: not a rotation"),
         ("point_mm", "points_mm", "points_mm"),
     ],
 )
 def test_what_makes_no_sense_is_refused_by_its_key(tmp_path, old, new, words):
-    assert old in FLEET
+    assert old in TURNED
     with pytest.raises(ConfigError, match=words):
-        load(tmp_path, FLEET.replace(old, new, 1))
+        load(tmp_path, TURNED.replace(old, new, 1))

@@ -1,68 +1,20 @@
 """Results for other programs: MATLAB, spreadsheets, and the laboratory's own channels beside them."""
 
 import csv
-import importlib.util
-from dataclasses import replace
-from pathlib import Path
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
+from small_lab import FLEET, UNITS, invented_run
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import RunFormatError
-from bricktrack_common.run_manifest import MANIFEST_NAME, write_manifest
 from bricktrack_host.assemblies.combined_test import combine_test, read_components, read_test
 from bricktrack_host.cli.main import app
 from bricktrack_host.results.daq_table import join_samples, read_daq_csv
 from bricktrack_host.results.export import read_run_table, write_table
-from bricktrack_host.results.result_store import write_results
-
-spec = importlib.util.spec_from_file_location(
-    "example_report", Path(__file__).parents[3] / "scripts" / "example_report.py"
-)
-example = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(example)
-
-FLEET = """
-[[unit]]
-name = "b7-1"
-address = "tcp://127.0.0.1:1001"
-
-[[unit]]
-name = "b7-2"
-address = "tcp://127.0.0.1:1002"
-
-[[assembly]]
-name = "brick-7"
-kind = "TCB"
-base = "A"
-
-[[assembly.component]]
-name = "A"
-
-[[assembly.component]]
-name = "B"
-
-[[assembly.component]]
-name = "C"
-point_mm = [0.0, 0.0, 60.0]
-
-[[assembly.view]]
-unit = "b7-1"
-camera_on = "A"
-leds_on = "B"
-position_brick_layout_mm = [10.0, 20.0, 30.0]
-
-[[assembly.view]]
-unit = "b7-2"
-camera_on = "B"
-leds_on = "C"
-position_brick_layout_mm = [-10.0, 20.0, 30.0]
-"""
 
 
 def invoke(*words):
@@ -74,13 +26,8 @@ def lab(tmp_path_factory):
     """A fleet file and the processed runs of its two units (invented, simulated)."""
     folder = tmp_path_factory.mktemp("lab")
     (folder / "fleet.toml").write_text(FLEET)
-    blank = example.example_result()
-    for unit in ("b7-1", "b7-2"):
-        run_id = f"{unit}_0001_shake"
-        manifest = msgspec.structs.replace(blank.manifest, unit=unit, run_id=run_id)
-        (folder / run_id).mkdir()
-        write_manifest(folder / run_id / MANIFEST_NAME, manifest)
-        write_results(replace(blank, manifest=manifest), folder / run_id / "results")
+    for unit in UNITS:
+        invented_run(folder / f"{unit}_0001_shake", unit)
     return folder
 
 
