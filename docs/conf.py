@@ -16,6 +16,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
+    "sphinx_copybutton",
 ]
 exclude_patterns = ["_build"]
 templates_path = ["_templates"]
@@ -36,6 +37,10 @@ napoleon_google_docstring = False
 # A list also takes two names on one line, and describes each field once.
 napoleon_custom_sections = [("Attributes", "params_style")]
 napoleon_use_rtype = False
+
+# A click copies what is to be typed: without the prompts, and without what the commands print.
+copybutton_prompt_text = "$ "
+copybutton_line_continuation_character = "\\"
 
 html_theme = "furo"
 html_title = "bricktrack"

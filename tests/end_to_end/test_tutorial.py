@@ -97,7 +97,7 @@ def test_the_parts_of_a_brick_move_as_they_were_made_to(tmp_path):
     for component, peak_mm in peaks.items():
         [row] = [line for line in combined.splitlines() if f"│ {component} " in line]
         assert float(re.findall(r"\d+\.\d+", row)[0]) == pytest.approx(float(peak_mm), abs=0.02)
-        assert f"{component}: 6 tables" in amplitudes
+        assert f"{component}: 6 tables of 15" in amplitudes
     assert "wrong" not in combined
     assert "b7-2: the loop that it closes gapes" in wrong
     table = np.loadtxt(tmp_path / "C_ux_mm.txt", delimiter=None)
