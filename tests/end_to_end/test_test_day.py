@@ -1,12 +1,9 @@
-"""A test day by its commands on light units; whatever is killed on the way, the same command goes on."""
+"""A test day by its commands on light units: what each says and leaves, also where something went wrong."""
 
 import importlib.util
-import random
 import re
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +12,6 @@ import pytest
 from light_fleet import LightFleet, write_fleet_file
 from typer.testing import CliRunner
 
-from bricktrack_common.checksums import sha256_file
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.assemblies.combined_test import read_test
 from bricktrack_host.cli import test_day
@@ -88,8 +84,7 @@ def test_a_shake_from_the_look_before_it_to_the_report(lab, tmp_path):
     assert all(re.search(rf"{name}: \S*_0001_shake-12 complete", words) for name in NAMES)
 
 
-def test_a_host_killed_at_every_step_loses_nothing_and_goes_on(lab, tmp_path):
-    draw = random.Random(3)
+def test_a_test_is_begun_again_but_not_another_of_its_name(lab, tmp_path):
     assert invoke("new", "s1")[0] == 0
     assert invoke("new", "s1")[0] == 0, "begun again, as after a kill"
     code, words = invoke("new", "s1", "--duration", "9")
@@ -97,31 +92,6 @@ def test_a_host_killed_at_every_step_loses_nothing_and_goes_on(lab, tmp_path):
     assert (
         "there is a test s1 already, of b7-1, b7-2, b8-1 for the units' own time; this one would be" in words
     )
-
-    for _ in range(3):  # while arming and waiting
-        arming = start("arm", "s1", cwd=tmp_path)
-        time.sleep(draw.uniform(0.2, 1.2))
-        arming.send_signal(signal.SIGKILL)
-        arming.communicate()
-    assert invoke("arm", "s1", "--no-wait")[0] == 0
-    lab.trigger(8_000_000)
-    code, words = invoke("arm", "s1")
-    assert code == 0, words
-
-    for _ in range(4):  # while pulling; these fail in the end, as a light unit's video cannot be processed
-        collecting = start("collect", "s1", cwd=tmp_path)
-        time.sleep(draw.uniform(0.4, 1.0))
-        collecting.send_signal(signal.SIGKILL)
-        collecting.communicate()
-    code, words = invoke("collect", "s1")
-    assert code == 0, words
-    for name in NAMES:
-        [run] = (tmp_path / "runs").glob(f"{name}_*_s1")
-        manifest = read_manifest(run / MANIFEST_NAME)
-        assert sha256_file(run / "video.h264") == manifest.files[0].sha256
-        [card] = (tmp_path / "cards" / name / "runs").glob("*_0001_s1")
-        assert card.name == run.name, "one arming, one run"
-    assert invoke("report", "s1")[0] == 0
 
 
 def test_who_is_not_ready_is_said_with_the_remedy(lab, tmp_path):
