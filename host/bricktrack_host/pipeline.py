@@ -15,6 +15,7 @@ from bricktrack_common.run_folder import Run, read_run
 from bricktrack_common.run_manifest import MANIFEST_NAME, TRUTH_NAME
 from bricktrack_host.calibration.calibration_file import load_calibration, require_match
 from bricktrack_host.quality import PoseFlag
+from bricktrack_host.reporting.fusion_check import TwoFusions
 from bricktrack_host.reporting.report import ReportExtras, render_report
 from bricktrack_host.reporting.report_pictures import PICTURES_NAME, save_pictures
 from bricktrack_host.results.result_store import (
@@ -129,7 +130,7 @@ def process_run(
     with stages("align clocks"):
         edge_fit = fit_square_wave(run, problems)
         imu = choose_imu(run, brick, settings, problems)
-        inertial = None if imu is None else align(optical, imu, run, edge_fit, settings, problems)
+        inertial = None if imu is None else align(optical, imu, run, brick, edge_fit, settings, problems)
         rest = rest_pose(optical, inertial, problems)
     with stages("fuse"):
         if settings.rolling_shutter:
@@ -148,7 +149,7 @@ def process_run(
         edge_fit=edge_fit,
         imu=imu,
         rest=rest,
-        alignment=alignment_details(inertial, fusion),
+        alignment=alignment_details(inertial, fusion, optical),
         calibration=calibration_details(rays),
         problems=tuple(problems),
         provenance=Provenance(
@@ -164,7 +165,11 @@ def process_run(
     with stages("write report"):
         comparison = _compare(result, folder, truth)
         overlays, covered = pictures.overlays(observations, optical), calibration_picture(rays)
-        page = render_report(result, ReportExtras(overlays=overlays, calibration=covered, truth=comparison))
+        two = None
+        if fusion is not None and fusion.pose_level is not None:
+            two = TwoFusions(fusion.track, fusion.pose_level)
+        extras = ReportExtras(overlays=overlays, calibration=covered, truth=comparison, fusions=two)
+        page = render_report(result, extras)
     with stages("write tables"):
 
         def write_page(partial: Path) -> None:

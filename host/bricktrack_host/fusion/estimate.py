@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ConfigError, ShapeError
 from bricktrack_host.fusion.camera_delay import settle_delay
+from bricktrack_host.fusion.cross_check import CrossCheck
 from bricktrack_host.fusion.fused_output import common_part, sample_motion
 from bricktrack_host.fusion.fusion_problem import NoiseLevel, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
@@ -72,6 +73,8 @@ class FusionResult:
     rotation_noise_scale, position_noise_scale : float
         What the stated optical sd had to be multiplied by. Below 1 where frames agree better than stated: the
         rest of the stated variance is an error that they share, and stays in the covariance given out.
+    pose_level, check : FusedTrack, CrossCheck, optional
+        Of a tightly coupled motion: the pose-level one at the same instants, and how far both are apart.
     """
 
     track: FusedTrack
@@ -98,6 +101,8 @@ class FusionResult:
     acc_noise: NoiseLevel
     rotation_noise_scale: float
     position_noise_scale: float
+    pose_level: FusedTrack | None = None
+    check: CrossCheck | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

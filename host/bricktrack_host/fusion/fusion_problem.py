@@ -177,11 +177,14 @@ def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
     whole = ~run.signal.in_gap(t_imu)
     whole = whole if whole.any() else np.ones(len(t_imu), dtype=bool)
     force = np.einsum("nij,nj->ni", run.R_seen[whole], run.signal.acc_at(t_imu[whole] + lag))
+    if run.camera is not None:
+        force = force - run.camera.still_force_mps2(t_imu[whole], lag)
     # The median is not drawn by a few impacts, and its direction is all that is taken.
     down = -np.median(force, axis=0)
     norm = float(np.linalg.norm(down))
     down = down / norm if norm > 0 else np.array([0.0, 1.0, 0.0])
-    gravity = down * settings.gravity_mps2 if run.camera is None else np.zeros(3)
+    # Of two sensors only the difference of their biases is left, and gravity, if one was zeroed before.
+    gravity = down * (settings.gravity_mps2 if run.camera is None else norm)
     return Linearisation(
         tau_s=tau,
         skew=a.skew,

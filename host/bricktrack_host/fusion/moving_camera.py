@@ -105,6 +105,11 @@ class CameraMotion:
         """Return the camera's angular rate in axes that stand still, shape (n, 3)."""
         return np.asarray(np.einsum("nij,nj->ni", self.still_attitude(t_s), self.omega_radps(t_s)))
 
+    def still_force_mps2(self, t_s: FloatArray, lag_s: float) -> FloatArray:
+        """Return the specific force at the camera's sensor in axes that stand still, shape (n, 3)."""
+        felt = self.signal.acc_at(self.own_s(t_s) + self.acc_lag_s(lag_s))
+        return np.asarray(np.einsum("nij,nj->ni", self.still_attitude(t_s), felt))
+
     def acc_lag_s(self, lag_s: float) -> float:
         """Return the accelerometer-minus-gyro lag of this sensor, when the brick's has ``lag_s``."""
         return lag_s if self.kind == "imu" else 0.0

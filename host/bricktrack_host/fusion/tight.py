@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
-from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.fusion.cross_check import CrossCheck, cross_check
 from bricktrack_host.fusion.estimate import FusionInput, FusionResult, fused_result, prepare_run
 from bricktrack_host.fusion.fused_output import common_part, sample_motion
 from bricktrack_host.fusion.fusion_problem import Nodes, Run, build_problem, place_nodes
@@ -25,7 +25,7 @@ from bricktrack_host.fusion.led_measurements import SeenLeds, led_arrays, led_ch
 from bricktrack_host.fusion.pose_level import Smoothed, relinearised, smooth_poses
 from bricktrack_host.fusion.smoother import Filter
 from bricktrack_host.fusion.time_alignment import TimeAlignment
-from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
+from bricktrack_host.tracks import ImuTrack, LedObservations, OpticalTrack
 
 logger = logging.getLogger(__name__)
 
@@ -33,28 +33,6 @@ _PASSES = 3
 _GATE_CHI2 = 20.7  # of 2 degrees of freedom; passed by all but one in 30 000
 _SCALE_STANDS = 1.05
 _CHI_2_MEDIAN = 1.386  # median of chi-square with 2 degrees of freedom
-_DISAGREE_CHI2 = 22.5  # of 6 degrees of freedom: one in 1000
-_DISAGREE_SHARE = 0.02
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CrossCheck:
-    """How far the tightly coupled motion lies from the pose-level one, at the instants of the output.
-
-    Attributes
-    ----------
-    rms_mm, max_mm, max_deg : float
-    share_apart : float
-        Instants at which they are farther apart than the pose-level covariance allows one in 1000.
-    agrees : bool
-        Whether those are few.
-    """
-
-    rms_mm: float
-    max_mm: float
-    max_deg: float
-    share_apart: float
-    agrees: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +117,7 @@ def fuse_tight(
     chi2_of_led[leds.frame, leds.led], rejected[leds.frame, leds.led] = chi2, ~use
     if rejected.any():
         logger.warning("%d of %d LED centroids left out as outliers", rejected.sum(), len(use))
-    check = _cross_check(track, pose_level.track)
+    check = cross_check(track, pose_level.track)
     if not check.agrees:
         logger.warning(
             "tightly coupled and pose-level motion are up to %.2f mm apart, and by more than they may in "
@@ -150,7 +128,7 @@ def fuse_tight(
     clocks = fused_result(item, smoothed, settings, track=track)
     fused = replace(
         clocks, frame_chi2=pose_level.frame_chi2, frame_rejected=pose_level.frame_rejected,
-        rotation_noise_scale=scale, position_noise_scale=scale,
+        rotation_noise_scale=scale, position_noise_scale=scale, pose_level=pose_level.track, check=check,
     )  # fmt: skip
     return TightResult(fused, pose_level, check, chi2_of_led, rejected, scale)
 
@@ -222,23 +200,4 @@ def _without_frames(run: Run) -> Run:
         R_seen=np.zeros((0, 3, 3)),
         p_seen_m=np.zeros((0, 3)),
         cov_seen=np.zeros((0, 6, 6)),
-    )
-
-
-def _cross_check(track: FusedTrack, pose_level: FusedTrack) -> CrossCheck:
-    both = np.isfinite(track.t_camera_brick_mm[:, 0]) & np.isfinite(pose_level.t_camera_brick_mm[:, 0])
-    if not both.any():
-        return CrossCheck(np.nan, np.nan, np.nan, 1.0, agrees=False)
-    turn = rvec_from_matrix(np.swapaxes(pose_level.R_camera_brick[both], 1, 2) @ track.R_camera_brick[both])
-    shift = track.t_camera_brick_mm[both] - pose_level.t_camera_brick_mm[both]
-    e = np.concatenate([turn, shift], axis=1)
-    chi2 = (e * np.linalg.solve(pose_level.covariance[both], e[..., None])[..., 0]).sum(axis=1)
-    apart = float((chi2 > _DISAGREE_CHI2).mean())
-    away = np.linalg.norm(shift, axis=1)
-    return CrossCheck(
-        rms_mm=float(np.sqrt(np.mean(away**2))),
-        max_mm=float(away.max()),
-        max_deg=float(np.degrees(np.linalg.norm(turn, axis=1).max())),
-        share_apart=apart,
-        agrees=apart <= _DISAGREE_SHARE,
     )

@@ -8,6 +8,12 @@ import numpy as np
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting import quality_plots
 from bricktrack_host.reporting.embedding import EmbeddedFigure, embed_chart, embed_overlay
+from bricktrack_host.reporting.fusion_check import (
+    CHECK_PREFIX,
+    TwoFusions,
+    fusion_check_chart,
+    fusion_check_words,
+)
 from bricktrack_host.reporting.plots import (
     CalibrationPicture,
     FrameOverlay,
@@ -30,11 +36,14 @@ class ReportExtras:
     calibration : CalibrationPicture or None
     truth : TruthComparison or None
         For simulated runs.
+    fusions : TwoFusions or None
+        The motion fused LED by LED, and pose by pose as the check.
     """
 
     overlays: Sequence[FrameOverlay] = ()
     calibration: CalibrationPicture | None = None
     truth: TruthComparison | None = None
+    fusions: TwoFusions | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +87,7 @@ def report_sections(result: RunResult, figures: KeyFigures, extras: ReportExtras
     )
     sections.append(Section("timing", "Timing", _timing_words(result, figures), [timing]))
     sections += _alignment_section(result)
+    sections += _fusion_check_section(result, figures, extras)
     calibration = Section("calibration", "Calibration")
     if result.calibration:
         rows = [[in_words(name), value_text(value)] for name, value in result.calibration.items()]
@@ -205,7 +215,11 @@ def _alignment_section(result: RunResult) -> list[Section]:
         return []
     section = Section("alignment", "Camera and inertial sensor")
     if result.alignment:
-        rows = [[in_words(name), value_text(value)] for name, value in result.alignment.items()]
+        rows = [
+            [in_words(name), value_text(value)]
+            for name, value in result.alignment.items()
+            if not name.startswith(CHECK_PREFIX)
+        ]
         section.tables.append(SectionTable("", ["", ""], rows, 2))
     if figure is not None:
         section.figures.append(embed_chart(
@@ -213,6 +227,22 @@ def _alignment_section(result: RunResult) -> list[Section]:
             "Above: the second in which the brick turns fastest. Below: the gyroscope's mean between two "
             "frames, less bias, less the optical rate; what follows the motion there is a time offset.",
         ))  # fmt: skip
+    return [section]
+
+
+def _fusion_check_section(result: RunResult, figures: KeyFigures, extras: ReportExtras) -> list[Section]:
+    words = fusion_check_words(result.alignment)
+    if not words:
+        return []
+    section = Section("fusion-check", "Fused in two ways", words)
+    if extras.fusions is not None:
+        section.figures.append(
+            embed_chart(
+                fusion_check_chart(result, figures, extras.fusions),
+                "Difference between the motions fused LED by LED and pose by pose",
+                "LED by LED less pose by pose, camera axes (above) and brick axes (below).",
+            )
+        )
     return [section]
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from bricktrack_common.arrays import FloatArray
+from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.errors import ConfigError, ShapeError, TrackingError
 from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2, ImuDescription, ImuSamples
@@ -14,6 +14,22 @@ from bricktrack_host.results.rest_pose import RestPose, tare
 from bricktrack_host.stages.camera_sensor import read_camera_sensor
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChipOrientation:
+    """What the chip itself says of its attitude, in its fusion modes; only compared with.
+
+    Attributes
+    ----------
+    t_ns : ndarray of int64, shape (n,)
+    q_wxyz_gravity_imu : ndarray, shape (n, 4)
+    R_brick_imu : ndarray, shape (3, 3)
+    """
+
+    t_ns: IntArray
+    q_wxyz_gravity_imu: FloatArray
+    R_brick_imu: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +45,7 @@ class Inertial:
         What feels the motion of a camera that moves.
     camera_alignment : CameraAlignment or None
         Of both, there.
+    chip : ChipOrientation or None
     is_hint : bool
         Whether the camera moves and nothing feels it: the samples cannot be fused, and only hint at turns and
         impacts.
@@ -38,6 +55,7 @@ class Inertial:
     alignment: TimeAlignment
     camera: CameraImu | None = None
     camera_alignment: CameraAlignment | None = None
+    chip: ChipOrientation | None = None
     is_hint: bool = False
 
 
@@ -58,14 +76,8 @@ def choose_imu(
     """Return the samples of the sensor on the LED component in brick axes, or `None` and why."""
     if not settings.use_imu:
         return None
-    if settings.imu is not None and settings.imu not in run.imus:
-        raise ConfigError(f"the run has no IMU '{settings.imu}'; it has: {', '.join(run.imus) or 'none'}")
-    sensor = settings.camera_sensor
-    cameras = {sensor.imu} if sensor is not None and sensor.kind == "imu" and not sensor.source else set()
-    names = [name for name in run.imus if name not in cameras]
-    if settings.imu in cameras:
-        raise ConfigError(f"IMU '{settings.imu}' moves with the camera; name the one on the LED component")
-    if not names:
+    name = _name_of_imu(run, settings)
+    if name is None:
         problems.append("no inertial samples: the motion is smoothed from the optical poses alone")
         return None
     if brick.R_brick_imu is None:
@@ -73,8 +85,27 @@ def choose_imu(
             "the layout file has no [imu], so the inertial samples cannot be used; optical poses alone"
         )
         return None
-    description, samples = run.imus[settings.imu or names[0]]
-    return imu_in_brick_axes(description, samples, brick.R_brick_imu)
+    return imu_in_brick_axes(*run.imus[name], brick.R_brick_imu)
+
+
+def _name_of_imu(run: Run, settings: ProcessSettings) -> str | None:
+    """Return the name of the sensor on the LED component, `None` where there is none."""
+    if settings.imu is not None and settings.imu not in run.imus:
+        raise ConfigError(f"the run has no IMU '{settings.imu}'; it has: {', '.join(run.imus) or 'none'}")
+    sensor = settings.camera_sensor
+    cameras = {sensor.imu} if sensor is not None and sensor.kind == "imu" and not sensor.source else set()
+    if settings.imu in cameras:
+        raise ConfigError(f"IMU '{settings.imu}' moves with the camera; name the one on the LED component")
+    return settings.imu or next((name for name in run.imus if name not in cameras), None)
+
+
+def chip_orientation(run: Run, brick: BrickModel, settings: ProcessSettings) -> ChipOrientation | None:
+    """Return what the chip on the LED component says of its attitude; `None` in its raw modes."""
+    name = _name_of_imu(run, settings)
+    if name is None or brick.R_brick_imu is None or not run.imus[name][0].fusion:
+        return None
+    samples = run.imus[name][1]
+    return ChipOrientation(samples.t_ns, samples.q_wxyz, brick.R_brick_imu)
 
 
 def imu_in_brick_axes(description: ImuDescription, samples: ImuSamples, R_brick_imu: FloatArray) -> ImuTrack:
@@ -92,6 +123,7 @@ def align(
     optical: OpticalTrack,
     imu: ImuTrack,
     run: Run,
+    brick: BrickModel,
     edge_fit: EdgeFit | None,
     settings: ProcessSettings,
     problems: list[str],
@@ -100,7 +132,7 @@ def align(
     # The daemon's stamps are of one clock and promise milliseconds; recordings from elsewhere nothing.
     within_s = settings.max_clock_offset_s
     prior_sd_ns = 5e6 if run.manifest.origin == "bricktrackd" else within_s * 1e9
-    camera = None
+    camera, chip = None, chip_orientation(run, brick, settings)
     if settings.camera != "static":
         sensor = settings.camera_sensor
         camera = None if sensor is None else read_camera_sensor(run, sensor, edge_fit, problems)
@@ -115,10 +147,10 @@ def align(
     try:
         if camera is not None:
             both = align_both(optical, imu, camera, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
-            inertial = Inertial(imu, both.brick, camera, both)
+            inertial = Inertial(imu, both.brick, camera, both, chip=chip)
         else:
             alignment = align_times(optical, imu, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
-            inertial = Inertial(imu, alignment, is_hint=settings.camera != "static")
+            inertial = Inertial(imu, alignment, chip=chip, is_hint=settings.camera != "static")
     except ShapeError as e:
         problems.append(f"the inertial samples cannot be used: {e}")
         return None

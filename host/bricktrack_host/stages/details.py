@@ -2,14 +2,20 @@
 
 import numpy as np
 
+from bricktrack_common.errors import TrackingError
 from bricktrack_host.calibration.calibration_file import Calibration, CentralRaysRecord
 from bricktrack_host.fusion.estimate import FusionResult
+from bricktrack_host.fusion.mount import check_chip_orientation
+from bricktrack_host.reporting.fusion_check import CHECK_PREFIX
 from bricktrack_host.reporting.plots import CalibrationPicture
 from bricktrack_host.results.result_store import Details
 from bricktrack_host.stages.clocks import Inertial
+from bricktrack_host.tracks import OpticalTrack
 
 
-def alignment_details(inertial: Inertial | None, fusion: FusionResult | None) -> Details:
+def alignment_details(
+    inertial: Inertial | None, fusion: FusionResult | None, optical: OpticalTrack
+) -> Details:
     """Return what the results say about the clocks, and what the fusion learned besides."""
     if inertial is None:
         return {"method": "none: no inertial samples were used"}
@@ -44,7 +50,35 @@ def alignment_details(inertial: Inertial | None, fusion: FusionResult | None) ->
             "gravity_camera_mps2": fusion.gravity_camera_mps2.tolist(),
             "mean_nis": fusion.mean_nis,
         }
+        details |= _chip_details(inertial, fusion, optical)
+        if fusion.check is not None:
+            details |= {
+                f"{CHECK_PREFIX}agrees": fusion.check.agrees,
+                f"{CHECK_PREFIX}apart_rms_mm": fusion.check.rms_mm,
+                f"{CHECK_PREFIX}apart_max_mm": fusion.check.max_mm,
+                f"{CHECK_PREFIX}apart_max_deg": fusion.check.max_deg,
+                f"{CHECK_PREFIX}share_beyond": fusion.check.share_apart,
+            }
     return {k: v.item() if isinstance(v, np.generic) else v for k, v in details.items()}
+
+
+def _chip_details(inertial: Inertial, fusion: FusionResult, optical: OpticalTrack) -> Details:
+    """Return how the chip's own orientation agrees with the camera's, where it gives one; camera at rest."""
+    chip = inertial.chip
+    if chip is None or inertial.camera is not None:
+        return {}
+    try:
+        check = check_chip_orientation(
+            optical, chip.t_ns, chip.q_wxyz_gravity_imu, R_brick_imu=chip.R_brick_imu,
+            alignment=inertial.alignment, gravity_camera_mps2=fusion.gravity_camera_mps2,
+        )  # fmt: skip
+    except TrackingError as e:
+        return {"chip_orientation": str(e)}
+    return {
+        "chip_orientation_off_rms_deg": check.rms_deg,
+        "chip_orientation_off_max_deg": check.max_deg,
+        "chip_gravity_off_deg": check.gravity_deg,
+    }
 
 
 def calibration_details(calibration: Calibration) -> Details:

@@ -1,0 +1,51 @@
+"""Whether the tightly coupled motion is where the pose-level one allows it to be."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.tracks import FusedTrack
+
+_DISAGREE_CHI2 = 22.5  # of 6 degrees of freedom: one in 1000
+_DISAGREE_SHARE = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossCheck:
+    """How far the tightly coupled motion lies from the pose-level one, at the instants of the output.
+
+    Attributes
+    ----------
+    rms_mm, max_mm, max_deg : float
+    share_apart : float
+        Instants at which they are farther apart than the pose-level covariance allows one in 1000.
+    agrees : bool
+        Whether those are few.
+    """
+
+    rms_mm: float
+    max_mm: float
+    max_deg: float
+    share_apart: float
+    agrees: bool
+
+
+def cross_check(track: FusedTrack, pose_level: FusedTrack) -> CrossCheck:
+    """Return how far two motions at the same instants are apart, by the covariance of the second."""
+    both = np.isfinite(track.t_camera_brick_mm[:, 0]) & np.isfinite(pose_level.t_camera_brick_mm[:, 0])
+    if not both.any():
+        return CrossCheck(np.nan, np.nan, np.nan, 1.0, agrees=False)
+    turn = rvec_from_matrix(np.swapaxes(pose_level.R_camera_brick[both], 1, 2) @ track.R_camera_brick[both])
+    shift = track.t_camera_brick_mm[both] - pose_level.t_camera_brick_mm[both]
+    e = np.concatenate([turn, shift], axis=1)
+    chi2 = (e * np.linalg.solve(pose_level.covariance[both], e[..., None])[..., 0]).sum(axis=1)
+    apart = float((chi2 > _DISAGREE_CHI2).mean())
+    away = np.linalg.norm(shift, axis=1)
+    return CrossCheck(
+        rms_mm=float(np.sqrt(np.mean(away**2))),
+        max_mm=float(away.max()),
+        max_deg=float(np.degrees(np.linalg.norm(turn, axis=1).max())),
+        share_apart=apart,
+        agrees=apart <= _DISAGREE_SHARE,
+    )
