@@ -15,7 +15,7 @@ from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_profile import collar_of
 from bricktrack_host.tracking.p3p import ray_centre_mm, rays_of, solve_p3p
-from bricktrack_host.tracking.prsoi import PrsoiForm, prsoi_starts
+from bricktrack_host.tracking.prsoi import ROUGH_MM, PrsoiForm, prsoi_starts
 from bricktrack_host.tracking.refine import MIN_LEDS, RefinedPoses, refine_poses
 
 _DOUBT_CHI2_PER_DOF = 9.0
@@ -68,7 +68,7 @@ def first_poses(
     form : "safe" or "printed"
         Of PRSOI, see there.
     """
-    R, t = prsoi_starts(uv_px, ray_model, brick_model, form)
+    R, t = prsoi_starts(uv_px, ray_model, brick_model, form, tolerance_mm=ROUGH_MM)
     poses = refine_poses(uv_px, cov_px2, R, t, ray_model, brick_model, collar_mm=collar_of(brick_model))
     poses, ambiguous = _other_starts(uv_px, cov_px2, poses, t_ns, ray_model, brick_model)
     return FirstPoses(uv_px, poses.R_camera_brick, poses.t_camera_brick_mm, ambiguous)

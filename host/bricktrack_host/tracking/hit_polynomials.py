@@ -116,6 +116,38 @@ def expand_at(polynomials: HitPolynomials, uv_px: FloatArray) -> FloatArray:
     return out.reshape(*uv_px.shape[:-1], 6, 4)
 
 
+def hits_at(polynomials: HitPolynomials, uv_px: FloatArray) -> FloatArray:
+    """Return hits at pixels (..., 2), shape (..., 4), mm: x and y on plane a, x and y on plane b."""
+    p = polynomials
+    st = np.ascontiguousarray(uv_px.reshape(-1, 2) / p.half_px - 1.0)
+    out = np.empty((len(st), 4))
+    _evaluate(st, p.coefficients, out)
+    return out.reshape(*uv_px.shape[:-1], 4)
+
+
+@compiled
+def _evaluate(st: FloatArray, coefficients: FloatArray, out: FloatArray) -> None:
+    """Horner's scheme in s inside Horner's scheme in t, by blocks, whose points run innermost."""
+    order, block = coefficients.shape[1] - 1, 16
+    s, t, q, f = np.zeros(block), np.zeros(block), np.empty(block), np.empty(block)
+    for first in range(0, len(st), block):
+        m = min(block, len(st) - first)
+        for p in range(m):
+            s[p], t[p] = st[first + p, 0], st[first + p, 1]
+        for c in range(4):
+            f[:] = 0.0
+            for j in range(order, -1, -1):
+                q[:] = 0.0
+                for i in range(order - j, -1, -1):
+                    k = coefficients[c, j, i]
+                    for p in range(block):
+                        q[p] = q[p] * s[p] + k
+                for p in range(block):
+                    f[p] = f[p] * t[p] + q[p]
+            for p in range(m):
+                out[first + p, c] = f[p]
+
+
 @compiled
 def _expand(st: FloatArray, coefficients: FloatArray, half: FloatArray, out: FloatArray) -> None:
     """Horner's scheme in s inside Horner's scheme in t, each with two derivatives (halved), by blocks.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled, compiled_in_place
 from bricktrack_host.tracking.p3p import pose_of_three, triangle_distances
 from bricktrack_host.tracking.small_algebra import rotation, solve
 
@@ -65,6 +65,35 @@ class Candidates(NamedTuple):
     number: IntArray
 
 
+class _Slots(NamedTuple):
+    """The best poses so far: assignments, poses, scores, their number."""
+
+    blob_of_led: IntArray
+    R: FloatArray
+    t: FloatArray
+    score: FloatArray
+    number: IntArray
+
+
+class _Room(NamedTuple):
+    """Room to work in: for the distances and poses of triples, and for the fits."""
+
+    four: FloatArray
+    distance: FloatArray
+    triads: FloatArray
+    R: FloatArray
+    t: FloatArray
+    hit: IntArray
+    apart: FloatArray
+    cosine: FloatArray
+    A: FloatArray
+    g: FloatArray
+    L: FloatArray
+    x: FloatArray
+    E: FloatArray
+    J: FloatArray
+
+
 @compiled
 def propose(lights: Lights, pattern: Pattern, out: Candidates) -> None:
     """Fill in the candidates of all pictures."""
@@ -78,26 +107,32 @@ def propose(lights: Lights, pattern: Pattern, out: Candidates) -> None:
         np.empty(_N_SLOTS),
         np.zeros(1, dtype=np.int64),
     )
+    room = _Room(
+        np.empty(4),
+        np.empty((4, 3)),
+        np.empty((3, 3, 3)),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(n_leds, dtype=np.int64),
+        np.empty(n_leds),
+        np.empty((n_lights, n_lights)),
+        np.empty((6, 6)),
+        np.empty(6),
+        np.empty((6, 6)),
+        np.empty(6),
+        np.empty((3, 3)),
+        np.empty((2, 6)),
+    )
     for i in range(n):
         f, s, z, count = lights.bearings[i], lights.slopes[i], lights.distance_mm[i], lights.number[i]
         _possible_pairs(f, z, count, pattern.gaps, possible)
         slots.number[0] = 0
-        _try_triples(f, s, z, count, pattern, pattern.radius[i], possible, slots)
-        _fit_slots(s, count, pattern, pattern.radius[i], slots)
+        _try_triples(f, s, z, count, pattern, pattern.radius[i], possible, slots, room)
+        _fit_slots(s, count, pattern, pattern.radius[i], slots, room)
         _hand_on(slots, out, i)
 
 
-class _Slots(NamedTuple):
-    """The best poses so far: assignments, poses, scores, their number."""
-
-    blob_of_led: IntArray
-    R: FloatArray
-    t: FloatArray
-    score: FloatArray
-    number: IntArray
-
-
-@compiled
+@compiled_in_place
 def _possible_pairs(f: FloatArray, z: FloatArray, count: int, gaps: FloatArray, possible: BoolArray) -> None:
     """Fill in which two LEDs two lights can be, by the LEDs' distance and what the lights' sizes tell."""
     for i in range(count):
@@ -116,7 +151,7 @@ def _possible_pairs(f: FloatArray, z: FloatArray, count: int, gaps: FloatArray, 
                     possible[i, j, a, b] = a != b and i != j and least <= gaps[a, b] <= most
 
 
-@compiled
+@compiled_in_place
 def _try_triples(
     f: FloatArray,
     s: FloatArray,
@@ -126,13 +161,12 @@ def _try_triples(
     radius: float,
     possible: BoolArray,
     slots: _Slots,
+    room: _Room,
 ) -> None:
     P, N, gaps, min_facing = pattern.P, pattern.N, pattern.gaps, pattern.min_facing
     n_leds = len(P)
-    four, distance, room = np.empty(4), np.empty((4, 3)), np.empty((3, 3, 3))
-    R, t = np.empty((3, 3)), np.empty(3)
-    hit, apart = np.empty(n_leds, dtype=np.int64), np.empty(n_leds)
-    cosine = np.empty((count, count))
+    four, distance, triads, R, t = room.four, room.distance, room.triads, room.R, room.t
+    hit, apart, cosine = room.hit, room.apart, room.cosine
     for i in range(count):
         for j in range(count):
             cosine[i, j] = f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2]
@@ -162,7 +196,7 @@ def _try_triples(
                                     distance[m, 0], distance[m, 1], distance[m, 2], z[i], z[j], z[k]
                                 ):
                                     continue
-                                if not pose_of_three(f, i, j, k, P, a, b, c, distance[m], R, t, room):
+                                if not pose_of_three(f, i, j, k, P, a, b, c, distance[m], R, t, triads):
                                     continue
                                 if not (
                                     _facing(R, N, a, f, i) > min_facing
@@ -175,7 +209,7 @@ def _try_triples(
                                     _keep(slots, hit, R, t, score)
 
 
-@compiled
+@compiled_in_place
 def _sizes_agree(d0: float, d1: float, d2: float, z0: float, z1: float, z2: float) -> bool:
     """Tell whether distances are what the lights' sizes, where known, allow; each, and in their ratios."""
     least, most = np.inf, 0.0
@@ -188,7 +222,7 @@ def _sizes_agree(d0: float, d1: float, d2: float, z0: float, z1: float, z2: floa
     return most <= _SAME_SCALE * least
 
 
-@compiled
+@compiled_in_place
 def _facing(R: FloatArray, N: FloatArray, k: int, f: FloatArray, i: int) -> float:
     total = 0.0
     for r in range(3):
@@ -196,7 +230,7 @@ def _facing(R: FloatArray, N: FloatArray, k: int, f: FloatArray, i: int) -> floa
     return total
 
 
-@compiled
+@compiled_in_place
 def _hits(
     R: FloatArray,
     t: FloatArray,
@@ -249,7 +283,7 @@ def _hits(
     return n_hits - 0.5 * total / n_hits
 
 
-@compiled
+@compiled_in_place
 def _keep(slots: _Slots, hit: IntArray, R: FloatArray, t: FloatArray, score: float) -> None:
     """Keep a pose if it is among the best; of those that are one, the better."""
     worst, at = 0, -1
@@ -271,7 +305,7 @@ def _keep(slots: _Slots, hit: IntArray, R: FloatArray, t: FloatArray, score: flo
     _put(slots, at, hit, R, t, score)
 
 
-@compiled
+@compiled_in_place
 def _put(slots: _Slots, at: int, hit: IntArray, R: FloatArray, t: FloatArray, score: float) -> None:
     slots.score[at] = score
     for k in range(len(hit)):
@@ -282,7 +316,7 @@ def _put(slots: _Slots, at: int, hit: IntArray, R: FloatArray, t: FloatArray, sc
             slots.R[at, r, c] = R[r, c]
 
 
-@compiled
+@compiled_in_place
 def _same(a: IntArray, b: IntArray) -> bool:
     n_different = 0
     for k in range(len(a)):
@@ -290,7 +324,7 @@ def _same(a: IntArray, b: IntArray) -> bool:
     return n_different == 0
 
 
-@compiled
+@compiled_in_place
 def _trace(A: FloatArray, B: FloatArray) -> float:
     """Return the trace of A' B, which is 1 + 2 cos of the turn between them."""
     total = 0.0
@@ -300,13 +334,13 @@ def _trace(A: FloatArray, B: FloatArray) -> float:
     return total
 
 
-@compiled
-def _fit_slots(s: FloatArray, count: int, pattern: Pattern, radius: float, slots: _Slots) -> None:
+@compiled_in_place
+def _fit_slots(
+    s: FloatArray, count: int, pattern: Pattern, radius: float, slots: _Slots, room: _Room
+) -> None:
     """Fit the kept poses to all their LEDs; their scores become log likelihood ratios, up to a constant."""
     n_leds = len(pattern.P)
-    A, g, L, x = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty(6)
-    E, J = np.empty((3, 3)), np.empty((2, 6))
-    hit, apart = np.empty(n_leds, dtype=np.int64), np.empty(n_leds)
+    A, g, L, x, E, J, hit, apart = room.A, room.g, room.L, room.x, room.E, room.J, room.hit, room.apart
     best = 0.0
     for i in range(slots.number[0]):
         best = max(best, math.floor(slots.score[i] + 0.5))
@@ -342,7 +376,7 @@ def _fit_slots(s: FloatArray, count: int, pattern: Pattern, radius: float, slots
         )
 
 
-@compiled
+@compiled_in_place
 def _point_step(
     s: FloatArray,
     hit: IntArray,
@@ -394,7 +428,7 @@ def _point_step(
     return True
 
 
-@compiled
+@compiled_in_place
 def _hand_on(slots: _Slots, out: Candidates, i: int) -> None:
     """Put the likeliest candidates, each once, into the results, best first."""
     n, best = 0, -np.inf
@@ -420,6 +454,9 @@ def _hand_on(slots: _Slots, out: Candidates, i: int) -> None:
         if is_new:
             for k in range(len(out.blob_of_led[i, n])):
                 out.blob_of_led[i, n, k] = slots.blob_of_led[top, k]
-            out.R[i, n], out.t[i, n] = slots.R[top], slots.t[top]
+            for r in range(3):
+                out.t[i, n, r] = slots.t[top, r]
+                for c in range(3):
+                    out.R[i, n, r, c] = slots.R[top, r, c]
             n += 1
     out.number[i] = n

@@ -19,7 +19,7 @@ from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_profile import predict_brick
 from bricktrack_host.tracking.paper_rules import identify_by_paper
 from bricktrack_host.tracking.pattern import NOT_FOLLOWED, follow_pattern
-from bricktrack_host.tracking.prsoi import prsoi_starts
+from bricktrack_host.tracking.prsoi import ROUGH_MM, prsoi_starts
 from bricktrack_host.tracking.segment import Blobs
 from bricktrack_host.tracking.verification import (
     MIN_INLIERS,
@@ -187,7 +187,7 @@ class _Run:
 
     def _verified(self, lights: LedLights, R: FloatArray, t: FloatArray, frames: IntArray) -> Verified:
         """Verify assignments of frames; ``R`` and ``t`` are the pose of the frame they were followed from."""
-        starts = prsoi_starts(lights.uv_px, self._rays, self._brick)
+        starts = prsoi_starts(lights.uv_px, self._rays, self._brick, tolerance_mm=ROUGH_MM)
         none = ~all_finite(starts[0], 2)  # LEDs in one plane
         starts[0][none], starts[1][none] = R, t
         verified = self._verify(lights, starts)

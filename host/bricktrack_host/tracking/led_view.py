@@ -8,17 +8,32 @@ outline's moments, the lens's curvature across the LED) is had once, as the LED'
 import math
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled_in_place
 
-SINE, SHIFT, SHIFT_1, SHIFT_2, HALF_LENGTH, AREA, LENS_U, LENS_V = range(8)
-N_SHAPE = 8
-"""An LED's shape: sine of the view angle about which the next three expand the shift of the centroid along
-the projected axis over that sine, mm; half length of the outline, mm; its area, mm^2; what the lens's
-curvature adds to the centroid, px."""
-_SINE_STEP = 0.02
+(
+    TANGENT,
+    SHIFT,
+    SHIFT_1,
+    HALF_LENGTH,
+    AREA,
+    LENS_U,
+    LENS_V,
+    AT_X,
+    AT_Y,
+    AT_Z,
+    SLOPE_X,
+    SLOPE_Y,
+) = range(12)
+N_SHAPE = 12
+"""An LED's shape: tangent of half the view angle, about which the next two expand the shift of the centroid
+along the projected axis over the angle's sine, mm (of a bare hemisphere it is linear in it); half length of
+the outline, mm; its area, mm^2; what the lens's curvature adds to the centroid, px; the centre that it is of,
+mm, and the slopes of the line of sight to there."""
+_TANGENT_STEP = 0.003
+_MAX_TANGENT = 3.0  # 143 degrees: nothing is seen of such an LED
 
 
-@compiled
+@compiled_in_place
 def outline(c: float, r: float, h: float, distance: float) -> tuple[float, float, float]:
     """Return area, centroid and half length of an outline; see `led_profile.outline_moments`."""
     s = math.sqrt(max(1 - c * c, 0.0))
@@ -52,7 +67,7 @@ def outline(c: float, r: float, h: float, distance: float) -> tuple[float, float
     return 2 * half_area, half_moment / half_area, 0.5 * (rho - rear)
 
 
-@compiled
+@compiled_in_place
 def pixel_near(
     x: float, y: float, b: float, hits: FloatArray, i: int, k: int
 ) -> tuple[float, float, float, float, float, float, float, float]:
@@ -113,7 +128,7 @@ def pixel_near(
     return du, dv, m11 / det, -m01 / det, -m10 / det, m00 / det, kx, ky
 
 
-@compiled
+@compiled_in_place
 def led_shape(
     centre: FloatArray,
     axis: FloatArray,
@@ -138,19 +153,20 @@ def led_shape(
     s = math.sqrt(ax * ax + ay * ay + az * az)
     if math.isnan(collar):  # the sphere's own outline
         half = radius / math.sqrt(1 - (radius / distance) ** 2)
-        shape[k, SINE], shape[k, SHIFT], shape[k, SHIFT_1], shape[k, SHIFT_2] = s, 0.0, 0.0, 0.0
+        shape[k, TANGENT], shape[k, SHIFT], shape[k, SHIFT_1] = 0.0, 0.0, 0.0
         shape[k, HALF_LENGTH], shape[k, AREA] = half, math.pi * half**2
     else:
-        at = min(max(s, 1.5 * _SINE_STEP), 1 - 1.5 * _SINE_STEP)
-        side = 1.0 if along <= 0 else -1.0
-        _, low, _ = outline(side * math.sqrt(1 - (at - _SINE_STEP) ** 2), radius, collar, distance)
-        area, middle, half = outline(side * math.sqrt(1 - at * at), radius, collar, distance)
-        _, high, _ = outline(side * math.sqrt(1 - (at + _SINE_STEP) ** 2), radius, collar, distance)
-        low, middle, high = low / (at - _SINE_STEP), middle / at, high / (at + _SINE_STEP)
-        shape[k, SINE], shape[k, SHIFT] = at, middle
-        shape[k, SHIFT_1] = (high - low) / (2 * _SINE_STEP)
-        shape[k, SHIFT_2] = (high - 2 * middle + low) / (2 * _SINE_STEP**2)
-        shape[k, HALF_LENGTH], shape[k, AREA] = half, area
+        at = min(max(s / (1 - along), 1.5 * _TANGENT_STEP), _MAX_TANGENT)
+        low, high = at - _TANGENT_STEP, at + _TANGENT_STEP
+        per_low, per_high = 1 / (1 + low * low), 1 / (1 + high * high)
+        area_low, shift_low, half_low = outline((1 - low * low) * per_low, radius, collar, distance)
+        area_high, shift_high, half_high = outline((1 - high * high) * per_high, radius, collar, distance)
+        shift_low, shift_high = shift_low / (2 * low * per_low), shift_high / (2 * high * per_high)
+        shape[k, TANGENT], shape[k, SHIFT] = at, 0.5 * (shift_low + shift_high)
+        shape[k, SHIFT_1] = (shift_high - shift_low) / (2 * _TANGENT_STEP)
+        shape[k, HALF_LENGTH], shape[k, AREA] = 0.5 * (half_low + half_high), 0.5 * (area_low + area_high)
+    shape[k, AT_X], shape[k, AT_Y], shape[k, AT_Z] = centre[0], centre[1], centre[2]
+    shape[k, SLOPE_X], shape[k, SLOPE_Y] = kx, ky
     # Unit vectors across the line of sight, the first along the projected axis.
     if s > 1e-6:
         e1x, e1y, e1z = ax / s, ay / s, az / s
@@ -173,7 +189,7 @@ def led_shape(
     shape[k, LENS_V] = var_1 * (0.5 * aa1 + grow_1 * a1) + var_2 * (0.5 * bb1 + grow_2 * b1)
 
 
-@compiled
+@compiled_in_place
 def _bend(
     a0: float,
     a1: float,
@@ -207,7 +223,7 @@ def _bend(
     return -(i00 * x + i01 * y), -(i10 * x + i11 * y)
 
 
-@compiled
+@compiled_in_place
 def led_view(
     centre: FloatArray,
     axis: FloatArray,
@@ -242,16 +258,19 @@ def led_view(
     shown_u, shown_v : float, px/mm
         What one millimetre along the projected axis is in the picture, times the sine of the view angle.
     """
-    _, _, _, _, _, _, kx, ky = pixel_near(centre[0], centre[1], (centre[2] - plane_a) / apart, hits, i, k)
-    kx, ky = kx / apart, ky / apart
+    # The line of sight turns as the centre moves, about a pupil near the camera's origin.
+    kx, ky, per_z = shape[k, SLOPE_X], shape[k, SLOPE_Y], 1 / centre[2]
+    moved = centre[2] - shape[k, AT_Z]
+    kx += (centre[0] - shape[k, AT_X] - kx * moved) * per_z
+    ky += (centre[1] - shape[k, AT_Y] - ky * moved) * per_z
     norm = math.sqrt(kx * kx + ky * ky + 1)
     dx, dy, dz = kx / norm, ky / norm, 1 / norm
     along = axis[0] * dx + axis[1] * dy + axis[2] * dz
     ax, ay, az = axis[0] - along * dx, axis[1] - along * dy, axis[2] - along * dz
     s = max(math.sqrt(ax * ax + ay * ay + az * az), 1e-9)
-    ds = s - shape[k, SINE]
-    per_sine = shape[k, SHIFT] + ds * (shape[k, SHIFT_1] + ds * shape[k, SHIFT_2])
-    slope = (shape[k, SHIFT_1] + 2 * ds * shape[k, SHIFT_2]) * along / s  # by the facing, -along
+    per_height = 1 / max(1 - along, 1e-3)
+    per_sine = shape[k, SHIFT] + (s * per_height - shape[k, TANGENT]) * shape[k, SHIFT_1]
+    slope = -shape[k, SHIFT_1] * per_height / s  # by the facing, -along
     x, y, z = centre[0] + per_sine * ax, centre[1] + per_sine * ay, centre[2] + per_sine * az
     du, dv, i00, i01, i10, i11, kx, ky = pixel_near(x, y, (z - plane_a) / apart, hits, i, k)
     kx, ky = kx / apart, ky / apart

@@ -10,7 +10,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.camera_model import RayModel
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled, compiled_in_place
 
 _DOUBLE_ROOT = 0.02
 """Noise makes a double root a pair with an imaginary part: up to this share of it, its real part serves."""
@@ -91,7 +91,7 @@ def _solve_all(
         count[i] = n
 
 
-@compiled
+@compiled_in_place
 def triangle_distances(
     a2: float, b2: float, c2: float, ca: float, cb: float, cg: float, four: FloatArray, out: FloatArray
 ) -> int:
@@ -119,7 +119,7 @@ def triangle_distances(
     return n
 
 
-@compiled
+@compiled_in_place
 def pose_of_three(
     f: FloatArray,
     i: int,
@@ -157,17 +157,17 @@ def pose_of_three(
     return True
 
 
-@compiled
+@compiled_in_place
 def _gap2(p: FloatArray, i: int, j: int) -> float:
     return float((p[i, 0] - p[j, 0]) ** 2 + (p[i, 1] - p[j, 1]) ** 2 + (p[i, 2] - p[j, 2]) ** 2)
 
 
-@compiled
+@compiled_in_place
 def _dot(f: FloatArray, i: int, j: int) -> float:
     return float(f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2])
 
 
-@compiled
+@compiled_in_place
 def _triad(p: FloatArray, i: int, j: int, k: int, out: FloatArray) -> bool:
     """Put an orthonormal frame into ``out``, one axis a row: along a side, in the plane of three points.
 
@@ -188,7 +188,7 @@ def _triad(p: FloatArray, i: int, j: int, k: int, out: FloatArray) -> bool:
     return True
 
 
-@compiled
+@compiled_in_place
 def real_quartic_roots(c4: float, c3: float, c2: float, c1: float, c0: float, out: FloatArray) -> int:
     """Put the real roots of a quartic into ``out`` and return their number; nearly double ones count as real.
 
@@ -230,7 +230,7 @@ def real_quartic_roots(c4: float, c3: float, c2: float, c1: float, c0: float, ou
     return n
 
 
-@compiled
+@compiled_in_place
 def _quadratic_roots(w: float, k: float, a: float, out: FloatArray, n: int) -> int:
     """Append the roots of y^2 + w y + k, less a / 4, to the n in ``out``; a nearly double pair's too."""
     square = 0.25 * w * w - k
@@ -244,7 +244,7 @@ def _quadratic_roots(w: float, k: float, a: float, out: FloatArray, n: int) -> i
     return n + 2
 
 
-@compiled
+@compiled_in_place
 def _largest_cubic_root(a: float, b: float, c: float) -> float:
     """Return the largest real root of x^3 + a x^2 + b x + c."""
     q, r = (a * a - 3 * b) / 9, (2 * a**3 - 9 * a * b + 27 * c) / 54

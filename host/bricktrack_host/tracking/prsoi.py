@@ -25,14 +25,15 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_a
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled, compiled_in_place
 from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
+from bricktrack_host.tracking.hit_polynomials import hit_polynomials, hits_at
 
 PrsoiForm = Literal["safe", "printed"]
 
 _MIN_DEPTH_MM = 1.0  # LEDs flatter than this leave the third column of H undetermined
-_TOLERANCE_MM = 1e-7
+TOLERANCE_MM = 1e-7
+ROUGH_MM = 0.01  # of depth; the form's own error is several times that at 0.05 px of noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,18 +98,34 @@ def prsoi_poses(
         b=plane_b_mm,
         printed=form == "printed",
         max_iterations=max_iterations,
-        cross_sign=1.0,
     )
 
 
 def prsoi_starts(
-    uv_px: FloatArray, ray_model: RayModel, brick_model: BrickModel, form: PrsoiForm = "safe"
+    uv_px: FloatArray,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    form: PrsoiForm = "safe",
+    *,
+    tolerance_mm: float = TOLERANCE_MM,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the PRSOI poses, (n, 3, 3) and (n, 3), of centroids (n, n_leds, 2), NaN where unseen."""
+    """Return the PRSOI poses, (n, 3, 3) and (n, 3), of centroids (n, n_leds, 2), NaN where unseen.
+
+    ``tolerance_mm`` is where the iteration ends; `ROUGH_MM` will do where a refinement follows.
+    """
     a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
-    hits = expand_at(hit_polynomials(ray_model), uv_px)[..., 0, :]
+    hits = hits_at(hit_polynomials(ray_model), uv_px)
     on_a, on_b = hits[..., :2], hits[..., 2:]
-    found = prsoi_poses(on_a, on_b, brick_model.led_positions_mm, plane_a_mm=a, plane_b_mm=b, form=form)
+    found = _iterate(
+        on_a,
+        on_b,
+        brick_model.led_positions_mm,
+        a=a,
+        b=b,
+        printed=form == "printed",
+        max_iterations=200,
+        tolerance_mm=tolerance_mm,
+    )
     return found.R_camera_brick, found.t_camera_brick_mm
 
 
@@ -121,93 +138,96 @@ def _iterate(
     b: float,
     printed: bool,
     max_iterations: int,
-    cross_sign: float,
+    cross_sign: float = 1.0,
+    tolerance_mm: float = TOLERANCE_MM,
 ) -> PrsoiPoses:
     if A.shape != B.shape or A.shape[1] != P.shape[0]:
         raise ShapeError(f"hits have shapes {A.shape} and {B.shape} for {P.shape[0]} LEDs; expected the same")
     n = A.shape[0]
     seen = all_finite(A) & all_finite(B)
-    R_all = np.full((n, 3, 3), np.nan)
-    t_all = np.full((n, 3), np.nan)
-    converged = np.zeros(n, dtype=bool)
-    n_iterations = np.zeros(n, dtype=np.int64)
-
-    reference = np.argmax(seen, axis=1)
-    rows = np.arange(n)
-    G = np.where(seen[..., None], P[None] - P[reference][:, None], 0.0)
-    # G, and with it H, are the same for all frames that see the same LEDs.
+    out = PrsoiPoses(
+        R_camera_brick=np.full((n, 3, 3), np.nan),
+        t_camera_brick_mm=np.full((n, 3), np.nan),
+        converged=np.zeros(n, dtype=bool),
+        n_iterations=np.zeros(n, dtype=np.int64),
+    )
+    # The LEDs' positions less the reference's, G, and its pseudo-inverse are the same for all frames that see
+    # the same LEDs.
     _, first, which = np.unique(
         seen @ (1 << np.arange(seen.shape[1])), return_index=True, return_inverse=True
     )
-    depth_mm = np.linalg.svd(G[first], compute_uv=False)[..., -1]
-    pseudo_inverses = np.linalg.pinv(G[first])
-    active = rows[(seen.sum(axis=1) >= 4) & (depth_mm[which] >= _MIN_DEPTH_MM)]
-    if active.size == 0:
-        return PrsoiPoses(R_all, t_all, converged, n_iterations)
-    G, seen, reference = G[active], seen[active], reference[active]
-    A, B = A[active], B[active]
-    here = np.arange(active.size)
-    H = pseudo_inverses[which[active]]
-    A0, B0 = A[here, reference], B[here, reference]
-    used = seen.copy()
-    used[here, reference] = False
-    dA = np.where(used[..., None], A - A0[:, None], 0.0)
-    dB = np.where(used[..., None], B - B0[:, None], 0.0)
-    BA = np.where(used[..., None], B - A, 0.0)
-    kappa_one = (dA * dB).sum(axis=(1, 2)) / (dA * dA).sum(axis=(1, 2))
-    if printed:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            kappa = dB / dA  # eq. 6: one ratio for each LED and axis
-    else:
-        kappa = np.broadcast_to(kappa_one[:, None, None], dA.shape)
-
-    kappa = np.ascontiguousarray(np.broadcast_to(kappa, dA.shape))
-    R, m, count, good = _solve_frames(
-        G, H, dA, BA, kappa, used, a, b, printed, max_iterations, cross_sign, _TOLERANCE_MM
+    G = np.where(seen[first][..., None], P[None] - P[np.argmax(seen[first], axis=1)][:, None], 0.0)
+    solvable = seen[first].sum(axis=1) >= 4
+    solvable &= np.linalg.svd(G, compute_uv=False)[..., -1] >= _MIN_DEPTH_MM
+    H = np.zeros((len(G), 3, len(P)))
+    H[solvable] = np.linalg.pinv(G[solvable])
+    _solve_frames(
+        np.ascontiguousarray(A),
+        np.ascontiguousarray(B),
+        np.ascontiguousarray(P),
+        seen,
+        np.where(solvable[which], which, -1),
+        G,
+        H,
+        a,
+        b,
+        printed,
+        max_iterations,
+        cross_sign,
+        tolerance_mm,
+        out.R_camera_brick,
+        out.t_camera_brick_mm,
+        out.converged,
+        out.n_iterations,
     )
-    if good.any():
-        along = ((m - a) / (b - a))[:, None]
-        T = np.concatenate([A0 + (B0 - A0) * along, m[:, None]], axis=1)[good]  # eq. 27
-        R_all[active[good]] = R[good]
-        t_all[active[good]] = T - np.einsum("nij,nj->ni", R[good], P[reference[good]])
-    converged[active[good]] = True
-    n_iterations[active] = count
-    return PrsoiPoses(R_all, t_all, converged, n_iterations)
+    return out
 
 
 @compiled
 def _solve_frames(
+    A: FloatArray,
+    B: FloatArray,
+    P: FloatArray,
+    seen: BoolArray,
+    which: IntArray,
     G: FloatArray,
     H: FloatArray,
-    dA: FloatArray,
-    BA: FloatArray,
-    kappa: FloatArray,
-    used: BoolArray,
     a: float,
     b: float,
     printed: bool,
     max_iterations: int,
     cross_sign: float,
     tolerance_mm: float,
-) -> tuple[FloatArray, FloatArray, IntArray, BoolArray]:
-    """Iterate frame by frame; return R, (n, 3, 3), m of the reference LED, rounds, and which converged."""
-    n, n_leds = used.shape
-    R_all, m_all = np.empty((n, 3, 3)), np.empty(n)
-    count, good = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
+    R_all: FloatArray,
+    t_all: FloatArray,
+    converged: BoolArray,
+    count: IntArray,
+) -> None:
+    """Iterate frame by frame; ``which`` is the frame's row of G and H, -1 for a frame without a pose."""
+    n, n_leds = seen.shape
     eps, IJ, R = np.empty(n_leds), np.empty((2, 3)), np.empty((3, 3))
+    dA, BA, kappa = np.empty((n_leds, 2)), np.empty((n_leds, 2)), np.empty((n_leds, 2))
+    new, rotation = np.empty((3, 3)), np.empty((3, 3))
     for f in range(n):
+        w = which[f]
+        if w < 0:
+            continue
+        reference = 0
+        while not seen[f, reference]:
+            reference += 1
+        _differences(A, B, f, reference, seen, printed, dA, BA, kappa)
         eps[:] = 0.0
-        m, change = 0.0, np.inf
-        while change > tolerance_mm and count[f] < max_iterations:
+        m, change, rounds = 0.0, np.inf, 0
+        while change > tolerance_mm and rounds < max_iterations:
             IJ[:] = 0.0
             for k in range(n_leds):
-                if used[f, k]:
+                if seen[f, k] and k != reference:
                     for axis in range(2):
-                        x = dA[f, k, axis]
-                        if count[f]:
-                            x += BA[f, k, axis] * eps[k] / ((b - m) + (m - a) * kappa[f, k, axis])
+                        x = dA[k, axis]
+                        if rounds:
+                            x += BA[k, axis] * eps[k] / ((b - m) + (m - a) * kappa[k, axis])
                         for c in range(3):
-                            IJ[axis, c] += H[f, c, k] * x
+                            IJ[axis, c] += H[w, c, k] * x
             length_i = math.sqrt(IJ[0, 0] ** 2 + IJ[0, 1] ** 2 + IJ[0, 2] ** 2)
             length_j = math.sqrt(IJ[1, 0] ** 2 + IJ[1, 1] ** 2 + IJ[1, 2] ** 2)
             s = math.sqrt(length_i * length_j)
@@ -218,34 +238,68 @@ def _solve_frames(
                 R[2, c] = cross_sign * (R[0, p] * R[1, q] - R[0, q] * R[1, p])
             total, n_used, change = 0.0, 0, 0.0
             for k in range(n_leds):
-                if not used[f, k]:
+                if not seen[f, k] or k == reference:
                     continue
                 for axis in range(2):  # eq. 20; the same for all LEDs and axes but in the printed form
                     if printed or n_used == 0:
-                        total += ((b - a) / s - b + a * kappa[f, k, axis]) / (kappa[f, k, axis] - 1)
+                        total += ((b - a) / s - b + a * kappa[k, axis]) / (kappa[k, axis] - 1)
                         n_used += 1
-                new = R[2, 0] * G[f, k, 0] + R[2, 1] * G[f, k, 1] + R[2, 2] * G[f, k, 2]
-                change = max(change, abs(new - eps[k])) if math.isfinite(new) else np.nan
-                eps[k] = new
+                depth = R[2, 0] * G[w, k, 0] + R[2, 1] * G[w, k, 1] + R[2, 2] * G[w, k, 2]
+                change = max(change, abs(depth - eps[k])) if math.isfinite(depth) else np.nan
+                eps[k] = depth
             m = total / n_used
-            count[f] += 1
+            rounds += 1
             if not (math.isfinite(change) and math.isfinite(m)):
                 break
+        count[f] = rounds
         for c in range(3):  # k = i x j, whatever sign the iteration was asked to take
             R[2, c] *= cross_sign
-        good[f] = change <= tolerance_mm and math.isfinite(m) and _nearest_rotation(R, R_all[f])
-        m_all[f] = m
-    return R_all, m_all, count, good
+        if change <= tolerance_mm and math.isfinite(m) and _nearest_rotation(R, new, rotation):
+            converged[f] = True
+            along = (m - a) / (b - a)
+            for r in range(3):  # eq. 27, and from the reference LED to the brick's origin
+                t_all[f, r] = A[f, reference, r] * (1 - along) + B[f, reference, r] * along if r < 2 else m
+                for c in range(3):
+                    R_all[f, r, c] = rotation[r, c]
+                    t_all[f, r] -= rotation[r, c] * P[reference, c]
 
 
-@compiled
-def _nearest_rotation(M: FloatArray, out: FloatArray) -> bool:
-    """Put the rotation nearest to a matrix of positive determinant into ``out``, by Newton's polar iteration.
+@compiled_in_place
+def _differences(
+    A: FloatArray,
+    B: FloatArray,
+    f: int,
+    reference: int,
+    seen: BoolArray,
+    printed: bool,
+    dA: FloatArray,
+    BA: FloatArray,
+    kappa: FloatArray,
+) -> None:
+    """Fill in a frame's hits on plane a less the reference's, from plane a to b, and their ratio kappa."""
+    both, own = 0.0, 0.0
+    for k in range(len(dA)):
+        if seen[f, k] and k != reference:
+            for axis in range(2):
+                dA[k, axis] = A[f, k, axis] - A[f, reference, axis]
+                BA[k, axis] = B[f, k, axis] - A[f, k, axis]
+                dB = B[f, k, axis] - B[f, reference, axis]
+                kappa[k, axis] = dB / dA[k, axis]  # eq. 6: one ratio for each LED and axis
+                both, own = both + dA[k, axis] * dB, own + dA[k, axis] ** 2
+    if not printed:
+        kappa[:] = both / own
+
+
+@compiled_in_place
+def _nearest_rotation(M: FloatArray, new: FloatArray, R: FloatArray) -> bool:
+    """Put the rotation nearest to a matrix of positive determinant into ``R``, by Newton's polar iteration.
 
     Each round takes half the sum of the matrix and its inverse's transpose, which is its cofactors over its
     determinant (Higham 1986). False where there is none.
     """
-    R, new = M.copy(), np.empty((3, 3))
+    for r in range(3):
+        for c in range(3):
+            R[r, c] = M[r, c]
     for _ in range(30):
         for r in range(3):
             for c in range(3):
@@ -262,5 +316,4 @@ def _nearest_rotation(M: FloatArray, out: FloatArray) -> bool:
                 R[r, c] = x
         if change < 1e-15:
             break
-    out[:] = R
     return True

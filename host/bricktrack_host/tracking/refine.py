@@ -16,7 +16,7 @@ from bricktrack_common.errors import TrackingError
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.hit_polynomials import HitPolynomials, expand_at, hit_polynomials
 from bricktrack_host.tracking.led_profile import shift_per_radius
-from bricktrack_host.tracking.refine_kernel import N_MORE, Fitted, Model, Observed, fit_frames
+from bricktrack_host.tracking.refine_kernel import N_MORE, Fitted, Model, Observed, fit_frames, room_for
 
 HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
@@ -150,11 +150,12 @@ def refine_poses(
     frames = np.flatnonzero((seen.sum(axis=1) >= MIN_LEDS) & started)
     model = _model(ray_model, brick_model, collar_mm, profile_is_exact)
     polynomials = hit_polynomials(ray_model)
+    room = room_for(n_leds)
     for first in range(0, frames.size, _CHUNK_FRAMES):
         rows = frames[first : first + _CHUNK_FRAMES]
         observed = _observed(uv_px[rows], cov_px2[rows], seen[rows], polynomials, motion, rows)
         fitted = _fitted(R_start[rows], t_start_mm[rows], n_leds)
-        fit_frames(observed, model, fitted, max_steps)
+        fit_frames(observed, model, fitted, room, max_steps)
         good = np.isfinite(fitted.cost)
         to = rows[good]
         out.R_camera_brick[to], out.t_camera_brick_mm[to] = fitted.R[good], fitted.t[good]

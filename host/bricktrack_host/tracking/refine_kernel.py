@@ -10,19 +10,22 @@ from typing import NamedTuple
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled_in_place
 from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view
 from bricktrack_host.tracking.small_algebra import inverse_block, quadratic, rotation, solve
 
 N_UNKNOWNS = 19
 _PROFILE, _TWIST, _RATE = 6, 7, 13
 N_MORE = N_UNKNOWNS - 6
-_FRESH_MM, _FRESH_RAD = 1.0, 0.05  # moved less than this, an LED's shape is good to 0.001 px
+_FRESH_MM, _FRESH_RAD = 1.0, 0.03  # moved less than this, an LED's shape is good to a few 0.001 px
 _RATE_PER_TWIST = 30.0
 """How wrong the twist's rate may be for a given doubt about the twist, 1/s. Of a sine of w T = 0.6 to pi (3
 to 15 Hz at 30 frames a second), a cubic spline's second derivative at the frames errs by 0.09 to 0.15 of the
 fourth difference over T^2, while the twist is doubted by 0.1 of it over T (`optical_track`)."""
-_DONE_SIGMAS = 1e-3  # a last step this small, and the next smaller still, is far below the pose's own error
+_LAST_SIGMAS = 0.3
+"""A step this small, in the pose's own uncertainty, is the last: the next would be some hundredths of it.
+Residuals follow it by their derivatives."""
+_DONE_SIGMAS = 1e-3  # one this small is not taken
 
 
 class Observed(NamedTuple):
@@ -76,17 +79,7 @@ class Fitted(NamedTuple):
     facing: FloatArray
 
 
-@compiled
-def fit_frames(observed: Observed, model: Model, fitted: Fitted, max_steps: int) -> None:
-    """Fit all frames whose start is a number; a frame without an answer has an infinite or NaN cost."""
-    n, n_leds = observed.seen.shape
-    room = _room(n_leds)
-    for i in range(n):
-        if math.isfinite(fitted.cost[i]):
-            _fit_frame(i, observed, model, fitted, max_steps, room)
-
-
-class _Room(NamedTuple):
+class Room(NamedTuple):
     """Room to work in, for one frame."""
 
     shapes: FloatArray
@@ -106,14 +99,15 @@ class _Room(NamedTuple):
     J_centre: FloatArray
     J_axis: FloatArray
     J: FloatArray
+    W: FloatArray
     R_shape: FloatArray
     t_shape: FloatArray
 
 
-@compiled
-def _room(n_leds: int) -> _Room:
+def room_for(n_leds: int) -> Room:
+    """Return room for the fits of bricks of so many LEDs."""
     k = N_UNKNOWNS
-    return _Room(
+    return Room(
         np.empty((n_leds, N_SHAPE)),
         np.empty((k, k)),
         np.empty(k),
@@ -130,14 +124,23 @@ def _room(n_leds: int) -> _Room:
         np.empty(3),
         np.empty((2, 3)),
         np.empty((2, 3)),
-        np.empty((2, k)),
+        np.zeros((n_leds, 2, k)),
+        np.empty((n_leds, 3)),
         np.empty((3, 3)),
         np.empty(3),
     )
 
 
-@compiled
-def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_steps: int, room: _Room) -> None:
+@compiled_in_place
+def fit_frames(observed: Observed, model: Model, fitted: Fitted, room: Room, max_steps: int) -> None:
+    """Fit all frames whose start is a number; a frame without an answer has an infinite or NaN cost."""
+    for i in range(len(observed.seen)):
+        if math.isfinite(fitted.cost[i]):
+            _fit_frame(i, observed, model, fitted, max_steps, room)
+
+
+@compiled_in_place
+def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_steps: int, room: Room) -> None:
     """Damped Gauss-Newton, so that no step raises the cost, until the step is far below its uncertainty.
 
     The LEDs' shapes are those of the start; where the pose went far from it, they are had anew.
@@ -155,7 +158,12 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
                 break
             if not solve(room.A, room.g, damping, n, room.L, room.step):
                 break
-            if quadratic(room.A, room.step, n) < _DONE_SIGMAS**2:
+            size2 = quadratic(room.A, room.step, n)
+            if size2 < _DONE_SIGMAS**2:
+                break
+            if size2 < _LAST_SIGMAS**2 and not rejected:
+                _move(R, t, more, room.step, room.E)
+                cost = _follow_residuals(i, n, observed, model, fitted, more, room)
                 break
             size = math.sqrt(room.step[0] ** 2 + room.step[1] ** 2 + room.step[2] ** 2)
             for c in range(n):
@@ -187,9 +195,9 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
     inverse_block(room.L, n, fitted.covariance[i], room.step)
 
 
-@compiled
+@compiled_in_place
 def _take_shapes(
-    i: int, observed: Observed, model: Model, R: FloatArray, t: FloatArray, more: FloatArray, room: _Room
+    i: int, observed: Observed, model: Model, R: FloatArray, t: FloatArray, more: FloatArray, room: Room
 ) -> None:
     # Fields of tuples are taken out once: each time they are touched or passed on is an atomic count.
     hits, seen, rvec, shift, dt = observed.hits, observed.seen, observed.rvec, observed.shift, observed.dt
@@ -201,7 +209,7 @@ def _take_shapes(
             led_shape(centre, axis, radii[k], model.collar, hits, i, k, model.plane_a, model.apart, shapes)
 
 
-@compiled
+@compiled_in_place
 def _place(
     i: int,
     k: int,
@@ -242,7 +250,7 @@ def _place(
             centre[r] += shift[i, k, r] + (more[4 + r] + more[10 + r] * 0.5 * dt[i, k]) * dt[i, k]
 
 
-@compiled
+@compiled_in_place
 def _normal_equations(
     i: int,
     observed: Observed,
@@ -251,7 +259,7 @@ def _normal_equations(
     R: FloatArray,
     t: FloatArray,
     more: FloatArray,
-    room: _Room,
+    room: Room,
     A: FloatArray,
     g: FloatArray,
 ) -> float:
@@ -276,11 +284,11 @@ def _normal_equations(
     E, R_led, centre, axis, shapes = room.E, room.R_led, room.centre, room.axis, room.shapes
     J, J_centre, J_axis = room.J, room.J_centre, room.J_axis
     residual, sigmas_out, area, facing_out = fitted.residual, fitted.sigmas, fitted.area, fitted.facing
+    W_own = room.W
     has_profile = model.profile_sd > 0
     n = N_UNKNOWNS if has_twist else _PROFILE + 1 if has_profile else _PROFILE
     for c in range(n):
         g[c] = 0.0
-        J[0, c], J[1, c] = 0.0, 0.0
         for b in range(c + 1):
             A[c, b] = 0.0
     cost = 0.0
@@ -300,7 +308,7 @@ def _normal_equations(
         for row in range(2):
             _pose_row(row, k, has_motion, has_twist, dt[i, k], P, N, R_led, E, J_centre, J_axis, J)
         if has_profile:
-            J[0, _PROFILE], J[1, _PROFILE] = per_profile * shown_u, per_profile * shown_v
+            J[k, 0, _PROFILE], J[k, 1, _PROFILE] = per_profile * shown_u, per_profile * shown_v
         w00, w01, w11 = W[i, k, 0, 0], W[i, k, 0, 1], W[i, k, 1, 1]
         if has_profile:  # this LED's own part of what the profile leaves unknown: inverse of cov + m m'
             own = per_profile * model.own_sd
@@ -308,24 +316,22 @@ def _normal_equations(
             p0, p1 = w00 * m0 + w01 * m1, w01 * m0 + w11 * m1
             gain = 1 / (1 + m0 * p0 + m1 * p1)
             w00, w01, w11 = w00 - gain * p0 * p0, w01 - gain * p0 * p1, w11 - gain * p1 * p1
+        W_own[k, 0], W_own[k, 1], W_own[k, 2] = w00, w01, w11
         sigmas = math.sqrt(max(w00 * r0 * r0 + 2 * w01 * r0 * r1 + w11 * r1 * r1, 0.0))
         residual[i, k, 0], residual[i, k, 1], sigmas_out[i, k] = r0, r1, sigmas
-        if sigmas <= huber:
-            cost += sigmas * sigmas
-        else:
-            cost += huber * (2 * sigmas - huber)
+        cost += _huber(sigmas, huber)
+        if sigmas > huber:
             weight = huber / sigmas
             w00, w01, w11 = w00 * weight, w01 * weight, w11 * weight
         for c in range(n):
-            j0, j1 = w00 * J[0, c] + w01 * J[1, c], w01 * J[0, c] + w11 * J[1, c]
+            j0, j1 = w00 * J[k, 0, c] + w01 * J[k, 1, c], w01 * J[k, 0, c] + w11 * J[k, 1, c]
             g[c] += j0 * r0 + j1 * r1
             for b in range(c + 1):
-                A[c, b] += j0 * J[0, b] + j1 * J[1, b]
+                A[c, b] += j0 * J[k, 0, b] + j1 * J[k, 1, b]
     if has_profile:
         per_sd = 1 / model.profile_sd**2
         A[_PROFILE, _PROFILE] += per_sd
         g[_PROFILE] -= more[0] * per_sd
-        cost += more[0] ** 2 * per_sd
     elif n > _PROFILE:
         A[_PROFILE, _PROFILE] = 1.0  # held where it is
     if has_twist:
@@ -333,11 +339,46 @@ def _normal_equations(
             sd = observed.twist_sd[i, c % 6] * (_RATE_PER_TWIST if c >= 6 else 1.0)
             A[_TWIST + c, _TWIST + c] += 1 / sd**2
             g[_TWIST + c] -= more[1 + c] / sd**2
-            cost += (more[1 + c] / sd) ** 2
+    return cost + _prior_cost(i, observed, model, more)
+
+
+@compiled_in_place
+def _huber(sigmas: float, limit: float) -> float:
+    return sigmas * sigmas if sigmas <= limit else limit * (2 * sigmas - limit)
+
+
+@compiled_in_place
+def _prior_cost(i: int, observed: Observed, model: Model, more: FloatArray) -> float:
+    """Return the cost of what is known beforehand of profile and twist."""
+    cost = (more[0] / model.profile_sd) ** 2 if model.profile_sd > 0 else 0.0
+    if observed.has_twist:
+        twist_sd = observed.twist_sd
+        for c in range(12):
+            cost += (more[1 + c] / (twist_sd[i, c % 6] * (_RATE_PER_TWIST if c >= 6 else 1.0))) ** 2
     return cost
 
 
-@compiled
+@compiled_in_place
+def _follow_residuals(
+    i: int, n: int, observed: Observed, model: Model, fitted: Fitted, more: FloatArray, room: Room
+) -> float:
+    """Let the frame's residuals follow the last step, of n unknowns, and return their cost."""
+    seen, J, W, step = observed.seen, room.J, room.W, room.step
+    residual, sigmas_out = fitted.residual, fitted.sigmas
+    cost = 0.0
+    for k in range(seen.shape[1]):
+        if not seen[i, k]:
+            continue
+        r0, r1 = residual[i, k, 0], residual[i, k, 1]
+        for c in range(n):
+            r0, r1 = r0 - J[k, 0, c] * step[c], r1 - J[k, 1, c] * step[c]
+        sigmas = math.sqrt(max(W[k, 0] * r0 * r0 + 2 * W[k, 1] * r0 * r1 + W[k, 2] * r1 * r1, 0.0))
+        residual[i, k, 0], residual[i, k, 1], sigmas_out[i, k] = r0, r1, sigmas
+        cost += _huber(sigmas, model.huber)
+    return cost + _prior_cost(i, observed, model, more)
+
+
+@compiled_in_place
 def _pose_row(
     row: int,
     k: int,
@@ -369,21 +410,21 @@ def _pose_row(
     t0 = P[k, 1] * z - P[k, 2] * y + N[k, 1] * s - N[k, 2] * q
     t1 = P[k, 2] * x - P[k, 0] * z + N[k, 2] * p - N[k, 0] * s
     t2 = P[k, 0] * y - P[k, 1] * x + N[k, 0] * q - N[k, 1] * p
-    J[row, 3], J[row, 4], J[row, 5] = c0, c1, c2
+    J[k, row, 3], J[k, row, 4], J[k, row, 5] = c0, c1, c2
     if has_twist:
         for order in range(2):
             share, at = (dt, _TWIST) if order == 0 else (0.5 * dt * dt, _RATE)
-            J[row, at], J[row, at + 1], J[row, at + 2] = t0 * share, t1 * share, t2 * share
-            J[row, at + 3], J[row, at + 4], J[row, at + 5] = c0 * share, c1 * share, c2 * share
+            J[k, row, at], J[k, row, at + 1], J[k, row, at + 2] = t0 * share, t1 * share, t2 * share
+            J[k, row, at + 3], J[k, row, at + 4], J[k, row, at + 5] = c0 * share, c1 * share, c2 * share
     if has_motion:  # R_led = R E: a turn theta of the frame's brick is E' theta of the LED's
-        J[row, 0] = E[0, 0] * t0 + E[0, 1] * t1 + E[0, 2] * t2
-        J[row, 1] = E[1, 0] * t0 + E[1, 1] * t1 + E[1, 2] * t2
-        J[row, 2] = E[2, 0] * t0 + E[2, 1] * t1 + E[2, 2] * t2
+        J[k, row, 0] = E[0, 0] * t0 + E[0, 1] * t1 + E[0, 2] * t2
+        J[k, row, 1] = E[1, 0] * t0 + E[1, 1] * t1 + E[1, 2] * t2
+        J[k, row, 2] = E[2, 0] * t0 + E[2, 1] * t1 + E[2, 2] * t2
     else:
-        J[row, 0], J[row, 1], J[row, 2] = t0, t1, t2
+        J[k, row, 0], J[k, row, 1], J[k, row, 2] = t0, t1, t2
 
 
-@compiled
+@compiled_in_place
 def _copy(
     R: FloatArray, t: FloatArray, more: FloatArray, R_to: FloatArray, t_to: FloatArray, more_to: FloatArray
 ) -> None:
@@ -395,7 +436,7 @@ def _copy(
         more_to[c] = more[c]
 
 
-@compiled
+@compiled_in_place
 def _move(R: FloatArray, t: FloatArray, more: FloatArray, step: FloatArray, E: FloatArray) -> None:
     rotation(step[0], step[1], step[2], E)
     for r in range(3):
@@ -407,7 +448,7 @@ def _move(R: FloatArray, t: FloatArray, more: FloatArray, step: FloatArray, E: F
         more[c] += step[6 + c]
 
 
-@compiled
+@compiled_in_place
 def _went_far(R: FloatArray, t: FloatArray, R_old: FloatArray, t_old: FloatArray) -> bool:
     moved, turned = 0.0, 0.0
     for r in range(3):

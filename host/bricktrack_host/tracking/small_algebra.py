@@ -3,10 +3,10 @@
 import math
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled_in_place
 
 
-@compiled
+@compiled_in_place
 def rotation(x: float, y: float, z: float, out: FloatArray) -> None:
     """Put the matrix of a rotation vector into ``out`` (Rodrigues' formula)."""
     angle2 = x * x + y * y + z * z
@@ -25,7 +25,7 @@ def rotation(x: float, y: float, z: float, out: FloatArray) -> None:
     out[1, 2], out[2, 1] = b * y * z - a * x, b * y * z + a * x
 
 
-@compiled
+@compiled_in_place
 def solve(A: FloatArray, g: FloatArray, damping: float, n: int, L: FloatArray, x: FloatArray) -> bool:
     """Solve (A + damping diag(A)) x = g by Cholesky, L is left; false if A is singular to precision."""
     for c in range(n, len(x)):
@@ -56,7 +56,7 @@ def solve(A: FloatArray, g: FloatArray, damping: float, n: int, L: FloatArray, x
     return True
 
 
-@compiled
+@compiled_in_place
 def quadratic(A: FloatArray, x: FloatArray, n: int) -> float:
     """Return x' A x, of which the lower half is given."""
     total = 0.0
@@ -67,7 +67,7 @@ def quadratic(A: FloatArray, x: FloatArray, n: int) -> float:
     return total
 
 
-@compiled
+@compiled_in_place
 def inverse_block(L: FloatArray, n: int, out: FloatArray, column: FloatArray) -> None:
     """Put the first (6, 6) block of the inverse of L L', (n, n), into ``out``; ``column`` has room for n."""
     for j in range(6):

@@ -15,7 +15,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_host.tracking.evidence import Evidence, evidence_of
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_profile import shift_per_radius
-from bricktrack_host.tracking.prsoi import prsoi_starts
+from bricktrack_host.tracking.prsoi import ROUGH_MM, prsoi_starts
 from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
 from bricktrack_host.tracking.segment import Blobs
 
@@ -223,7 +223,7 @@ def verify(
     """
     uv = lights.uv_px.copy()
     n = len(uv)
-    R, t = starts if starts is not None else prsoi_starts(uv, ray_model, brick_model)
+    R, t = starts if starts is not None else prsoi_starts(uv, ray_model, brick_model, tolerance_mm=ROUGH_MM)
     gate = np.broadcast_to(np.asarray(gate_px, dtype=np.float64), n)
     picture = np.arange(n) if picture is None else picture
     mode = ray_model.sensor_mode
