@@ -1,5 +1,6 @@
 """Works done by the workers of a Dask cluster, over its ``concurrent.futures`` executor."""
 
+import re
 import time
 import uuid
 from concurrent.futures import CancelledError, Future
@@ -20,6 +21,7 @@ from bricktrack_host.many_runs.workers import (
 
 _ANSWER_S = 10.0  # for the scheduler to answer
 _WITHOUT_WORKERS_S = 60.0  # a nanny starts a killed worker again within seconds
+_ADDRESS = r"(tcp|tls)://(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}|inproc://.+"
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +168,8 @@ def _connect(address: str, tls: TlsFiles | None) -> Any:
         from distributed import Client, Security
     except ModuleNotFoundError as e:
         raise ConfigError("Dask is not installed. Install it with: pip install 'bricktrack[scale]'") from e
+    if re.fullmatch(_ADDRESS, address) is None:
+        raise ConfigError(f"{address!r} is no scheduler's address; expected one as tcp://10.0.0.5:8786")
     security = None
     if address.startswith("tls://"):
         if tls is None:

@@ -100,6 +100,9 @@ def test_a_worker_of_several_threads_is_refused_with_the_remedy():
 
 def test_where_nobody_answers_or_works_that_is_said(monkeypatch):
     monkeypatch.setattr(dask_cluster, "_ANSWER_S", 0.5)
+    for wrong in ("hello", "10.0.0.5:8786", "tcp://10.0.0.5", "http://10.0.0.5:8786"):
+        with pytest.raises(ConfigError, match="is no scheduler's address; expected one as tcp://"):
+            DaskCluster(wrong)
     with pytest.raises(ConfigError, match="no Dask scheduler answers at tcp://127.0.0.1:9 "):
         DaskCluster("tcp://127.0.0.1:9")
     with (
