@@ -6,7 +6,7 @@ runs through the command itself; then the results of all ways are compared byte 
 worker is killed with SIGKILL in the middle, and the results must still be the same:
 
     python scripts/bench_scale.py
-    python scripts/bench_scale.py --runs 8 --duration 3
+    python scripts/bench_scale.py --runs 4 --duration 15
 """
 
 import argparse
@@ -30,6 +30,7 @@ import psutil
 from bench_process import simulated_recording
 
 from bricktrack_common.checksums import sha256_file
+from bricktrack_common.run_folder import read_run
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest, write_manifest
 from bricktrack_host.many_runs.processing_record import RECORD_NAME, Took, read_record
 from bricktrack_host.results.result_store import TIMINGS_NAME
@@ -53,8 +54,7 @@ def copies(run: Path, folder: Path, n_runs: int) -> list[Path]:
     manifest = read_manifest(run / MANIFEST_NAME)
     made = []
     for i in range(1, n_runs + 1):
-        unit, boot, _, label = manifest.run_id.rsplit("_", 3)
-        copy = folder / f"{unit}_{boot}_{i:04d}_{label}"
+        copy = folder / f"{manifest.run_id}-{i:02d}"
         copy.mkdir(parents=True)
         for path in run.iterdir():
             if path.is_file() and path.name != MANIFEST_NAME:
@@ -143,16 +143,24 @@ def main() -> None:
     )
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--duration", type=int, default=3, help="seconds that the recording lasts")
+    parser.add_argument("--run", type=Path, help="another short run, with its calibration and layout")
+    parser.add_argument("--calibration", type=Path)
+    parser.add_argument("--layout", type=Path)
     options = parser.parse_args()
-    recorded, calibration, layout = simulated_recording(options.duration)
+    if options.run is None:
+        recorded, calibration, layout = simulated_recording(options.duration)
+    elif options.calibration is None or options.layout is None:
+        parser.error("--run needs --calibration and --layout")
+    else:
+        recorded, calibration, layout = options.run, options.calibration, options.layout
     belongings = ["--calibration", str(calibration), "--layout", str(layout)]
     with tempfile.TemporaryDirectory(prefix="bricktrack-scale-") as name:
         folder = Path(name)
         runs = copies(recorded, folder / "runs", options.runs)
         n_bytes = sum(p.stat().st_size for p in runs[0].iterdir() if p.is_file())
         print(
-            f"{len(runs)} runs of {options.duration} s (simulated), copies of one under other ids, "
-            f"{n_bytes / 1e6:.1f} MB each; {os.cpu_count()} processors\n"
+            f"{len(runs)} runs of {_length_s(recorded):.1f} s{_simulated(recorded)}, copies of one under other "
+            f"ids, {n_bytes / 1e6:.1f} MB each; {os.cpu_count()} processors\n"
         )
         process("first", runs[:1], belongings, "--jobs", "1")  # compiles, where nothing has yet
         passes = [
@@ -174,6 +182,17 @@ def main() -> None:
         print(
             f"results of a run: {sum(p.stat().st_size for p in results) / 1e6:.1f} MB in {len(results)} files"
         )
+
+
+def _length_s(run: Path) -> float:
+    frames = read_run(run).frames
+    if frames is None:
+        raise SystemExit(f"{run}: no frame times")
+    return float(frames.sensor_timestamp_ns[-1] - frames.sensor_timestamp_ns[0]) / 1e9
+
+
+def _simulated(run: Path) -> str:
+    return " (simulated)" if read_manifest(run / MANIFEST_NAME).simulated else ""
 
 
 def _report(passes: list[Pass], n_runs: int) -> None:
