@@ -23,13 +23,14 @@ from bricktrack_host.assemblies.component_motion import (
     LoopCheck,
     assembly_motion,
 )
-from bricktrack_host.durable_files import write_folder_whole
+from bricktrack_host.durable_files import kept_beside, write_folder_whole
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.edge_comparison import EdgeComparison, compare_edges
 from bricktrack_host.results.result_store import (
     Details,
     Provenance,
     RunResult,
+    content_id,
     read_parquet,
     read_result,
     software_version,
@@ -141,6 +142,7 @@ def combine_test(
 ) -> TestSummary:
     """Compare the units of one shake, solve its assemblies, and write both to a folder, whole or not at all.
 
+    An earlier combination that says something else is kept beside it, as ``<folder>_1``.
     Memory is that of the largest assembly's results, and of the inertial samples of all units.
 
     Parameters
@@ -201,8 +203,17 @@ def combine_test(
             say("writing the report", 0, 1)
             also(partial)
 
-    write_folder_whole(folder, write, marker=TEST_SUMMARY_NAME)
+    write_folder_whole(folder, write, marker=TEST_SUMMARY_NAME, keep_if=_says_other)
     return read_test(folder)
+
+
+def earlier_tests(folder: Path) -> list[Path]:
+    """Return the combinations of before that are kept beside a test's folder, the oldest first."""
+    return kept_beside(folder, marker=TEST_SUMMARY_NAME)
+
+
+def _says_other(new: Path, old: Path) -> bool:
+    return content_id(new, TEST_SUMMARY_NAME) != content_id(old, TEST_SUMMARY_NAME)
 
 
 def read_test(folder: Path) -> TestSummary:

@@ -5,7 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bricktrack_common.errors import ConfigError, RunFormatError
-from bricktrack_host.assemblies.combined_test import TEST_SUMMARY_NAME, read_components, read_test
+from bricktrack_host.assemblies.combined_test import (
+    TEST_SUMMARY_NAME,
+    earlier_tests,
+    read_components,
+    read_test,
+)
 from bricktrack_host.assemblies.motion_history import component_histories
 from bricktrack_host.datasets.comparison import Alike, compare_components, compare_runs
 from bricktrack_host.results.result_store import (
@@ -50,7 +55,7 @@ def compare(before: Path, after: Path | None = None, *, progress: Progress | Non
     ----------
     before : Path
         A run, its results, a combined test, or a folder of runs. Without ``after`` what it holds now is
-        compared with what its last processing replaced.
+        compared with what its last processing, or combination, replaced.
     after : Path, optional
         Likewise; of the same kind.
 
@@ -62,6 +67,8 @@ def compare(before: Path, after: Path | None = None, *, progress: Progress | Non
         If results cannot be read, or two of them are of different recordings.
     """
     say = progress or (lambda _what, _done, _of: None)
+    if after is None and (path := earlier_tests(before)):
+        before, after = path[-1], before
     if after is None:
         sides = [(name, _last_replaced(now), now) for name, now in _runs_in(before).items()]
         runs = [(name, old, now) for name, old, now in sides if old is not None]

@@ -208,7 +208,12 @@ def results_id(folder: Path) -> str:
 
     Results of the same numbers have the same id, whenever and wherever they were made.
     """
-    names = sorted(p.name for p in folder.iterdir() if p.name == SUMMARY_NAME or p.suffix == ".parquet")
+    return content_id(folder, SUMMARY_NAME)
+
+
+def content_id(folder: Path, summary: str) -> str:
+    """Return 16 hexadecimal digits of a hash of a folder's summary and tables, and of nothing else there."""
+    names = sorted(p.name for p in folder.iterdir() if p.name == summary or p.suffix == ".parquet")
     listed = "".join(f"{name} {sha256_file(folder / name)}\n" for name in names)
     return hashlib.sha256(listed.encode()).hexdigest()[:16]
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import msgspec
@@ -170,6 +171,8 @@ def lab(tmp_path_factory):
     other = msgspec.structs.replace(result.provenance, calibration_sha256="a" * 64)
     write_results(replace(moved(result, shift_mm=shift_mm), provenance=other), results["b7-2"])
     combine_test("shake-12", results, [BRICK], folder / "second")
+    shutil.copytree(folder / "first", folder / "shake-12")
+    combine_test("shake-12", results, [BRICK], folder / "shake-12")
     return folder
 
 
@@ -196,6 +199,10 @@ def test_a_test_brings_its_components_too(lab):
     length = np.linalg.norm(by_name["brick-7: C"].difference[:, :3], axis=1)
     np.testing.assert_allclose(length[np.isfinite(length)], 0.2, atol=1e-9)
     assert compare(lab / "second").only_after == ["b7-1"]
+    assert (lab / "shake-12_1" / "test.json").read_bytes() == (lab / "first" / "test.json").read_bytes()
+    kept = {pair.name: pair for pair in compare(lab / "shake-12").pairs}
+    assert kept.keys() == by_name.keys()
+    np.testing.assert_array_equal(kept["brick-7: C"].difference, by_name["brick-7: C"].difference)
 
 
 def test_folders_of_runs_are_matched_by_name(lab, tmp_path):
