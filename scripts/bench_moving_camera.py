@@ -27,7 +27,7 @@ from bricktrack_host.fusion.estimate import fuse
 from bricktrack_host.fusion.moving_camera import CameraImu
 
 DROPOUTS = ((2.0, 2.4), (3.6, 3.9), (5.0, 5.5))
-MOTIONS = ((0.0, 0.0), (0.3, 0.0), (0.3, 1.0), (0.3, 2.0))  # g and degrees, rms in each axis
+MOTIONS = ((0.0, 0.0), (0.3, 0.0), (0.3, 0.7), (0.3, 1.4), (0.3, 2.0))  # g and degrees, rms in each axis
 STEP_NS = 5_000_000
 
 
@@ -73,7 +73,7 @@ def main() -> None:
         outside, inside = [row[0] for row in rows], [row[1] for row in rows]
         error = rms(outside + inside)
         at_rest = error if i == 0 else at_rest
-        name = "at rest" if i == 0 else f"{acc_g:g} g, rocking {rocking_deg:g} deg"
+        name = "at rest" if i == 0 else f"{acc_g:g} g, rocking {rocking_deg:g} deg rms"
         offset = float(np.sqrt(np.mean(np.square([row[2] for row in rows]))))
         table.add_row(
             name, f"{rms(outside):.4f}", f"{rms(inside):.4f}", f"{error:.4f}",

@@ -109,6 +109,7 @@ def align(
                 report, simulated = _report(
                     run, poses, imu, lever_arm_mm, within, stamps_sd_ms, with_mount=mount
                 )
+                chip = _chip_figures(run, layout, report) if mount else {}
         except BricktrackError as e:
             if len(sources) == 1:
                 raise
@@ -116,11 +117,11 @@ def align(
             failed += 1
             continue
         name = run.name if run is not None else f"{poses} and {imu}"
-        figures = report.figures()
+        figures = report.figures() | chip
         rows.append({"recording": name, "simulated": simulated, **figures})
         failed += not figures["trusted"] or figures["stamps_agree"] is False
         if not json:
-            _say(name + (" (simulated)" if simulated else ""), report)
+            _say(name + (" (simulated)" if simulated else ""), report, chip)
         if plot is not None:
             from bricktrack_host.reporting.alignment_plot import save_alignment_plot
 
@@ -185,6 +186,12 @@ def _read_run(run: Path) -> "tuple[OpticalTrack, ImuTrack, bool, bool]":
     result = read_result(results_of(run))
     if result.imu is None:
         raise ConfigError(f"{run}: the run was processed without inertial samples: there is nothing to align")
+    camera = result.provenance.settings.get("camera", "static")
+    if camera != "static":
+        raise ConfigError(
+            f"{run}: its camera moves (camera = {camera!r}), and one IMU alone says nothing of its clock "
+            "there. How the clocks lie is in the run's report, under 'Camera and inertial sensor'"
+        )
     own_clock = result.manifest.origin == "bricktrackd"
     return result.optical, result.imu, own_clock, result.manifest.simulated
 
@@ -208,7 +215,38 @@ def _read_files(poses: Path, imu: Path) -> "tuple[OpticalTrack, ImuTrack]":
     return read_poses_csv(poses, sd_deg=0.1, sd_mm=0.1), track
 
 
-def _say(name: str, report: "AlignmentReport") -> None:
+def _chip_figures(
+    run: Path | None, layout: Path | None, report: "AlignmentReport"
+) -> "dict[str, float | None]":
+    """Return how the chip's own orientation agrees with the camera's; nothing of a run in a raw mode."""
+    from bricktrack_common.brick_model import load_brick_model
+    from bricktrack_common.run_folder import read_run
+    from bricktrack_common.run_manifest import MANIFEST_NAME
+    from bricktrack_host.fusion.mount import check_chip_orientation
+    from bricktrack_host.results.result_store import read_result, results_of
+    from bricktrack_host.stages.clocks import chip_orientation
+    from bricktrack_host.stages.settings import ProcessSettings
+
+    if run is None or layout is None or report.fused is None or not (run / MANIFEST_NAME).is_file():
+        return {}
+    result = read_result(results_of(run))
+    chosen = result.provenance.settings.get("imu")
+    settings = ProcessSettings(imu=chosen if isinstance(chosen, str) else None)
+    chip = chip_orientation(read_run(run), load_brick_model(layout), settings)
+    if chip is None:
+        return {}
+    check = check_chip_orientation(
+        result.optical, chip.t_ns, chip.q_wxyz_gravity_imu, R_brick_imu=chip.R_brick_imu,
+        alignment=report.alignment, gravity_camera_mps2=report.fused.gravity_camera_mps2,
+    )  # fmt: skip
+    return {
+        "chip_orientation_off_rms_deg": check.rms_deg,
+        "chip_orientation_off_max_deg": check.max_deg,
+        "chip_gravity_off_deg": check.gravity_deg,
+    }
+
+
+def _say(name: str, report: "AlignmentReport", chip: "dict[str, float | None]") -> None:
     f = report.figures()
     table = Table(title=f"Clocks of {name}", title_justify="left", show_header=False, box=None)
     table.add_column(style="bold")
@@ -234,6 +272,13 @@ def _say(name: str, report: "AlignmentReport") -> None:
         table.add_row("correlation of angular speeds", f"{f['correlation']:.3f}")
     if report.mount is not None:
         _add_mount(table, report.mount)
+    if chip:
+        table.add_row(
+            "the chip's own orientation",
+            f"{chip['chip_orientation_off_rms_deg']:.2f} deg rms from the camera's, "
+            f"{chip['chip_orientation_off_max_deg']:.2f} at most; its gravity "
+            f"{chip['chip_gravity_off_deg']:.2f} deg from that of the run",
+        )
     if f["stamps_agree"] is None:
         verdict = "the motion tells no offset: the stamps are all there is"
     elif f["stamps_agree"]:
