@@ -99,6 +99,9 @@ def test_with_an_imu_beside_the_camera_the_motion_is_fused_and_without_it_is_not
     assert not fused.fused["edge"].flags[0] & PoseFlag.OPTICAL_ONLY
     assert fused.alignment["camera_sensor"] == "imu"
     assert fused.provenance.settings["camera_sensor_imu"] == "camera"
+    page = (pair.folder / "results-own" / "report.html").read_text(encoding="utf-8")
+    assert "camera sensor" in page
+    assert "Angular rates of gyroscope and optics" not in page  # they differ by the camera's own rocking
     alone, words = process(pair, "none")
     assert NOT_OBSERVABLE in words.replace("\n", " ") and "not observable" not in said
     assert (alone.fused["edge"].flags & PoseFlag.OPTICAL_ONLY != 0).all()

@@ -124,8 +124,12 @@ def imu_lateness_us(result: RunResult) -> FloatArray | None:
     """Return how long after its slot each inertial sample was taken, us; NaN in gaps."""
     if result.imu is None or not result.manifest.imus or not len(result.imu.t_ns):
         return None
-    chosen = result.provenance.settings.get("imu")
-    grid = next((i for i in result.manifest.imus if i.name == chosen), result.manifest.imus[0])
+    settings = result.provenance.settings
+    chosen, other = settings.get("imu"), settings.get("camera_sensor_imu")
+    if settings.get("camera_sensor_source"):
+        other = None  # it is in another unit's run
+    grids = [i for i in result.manifest.imus if i.name != other] or result.manifest.imus
+    grid = next((i for i in grids if i.name == chosen), grids[0])
     after_ns = (result.imu.t_ns - grid.latency_ns - grid.t0_ns) % grid.period_ns
     if result.manifest.origin == "import":  # the grid was made from the stamps: half of them come before it
         after_ns = np.where(after_ns > grid.period_ns // 2, after_ns - grid.period_ns, after_ns)

@@ -35,9 +35,9 @@ class RateComparison:
 
 
 def compare_rates(result: RunResult) -> RateComparison | None:
-    """Return both angular rates of a run; `None` without either."""
+    """Return both angular rates of a run; `None` without either, or where the camera turns as well."""
     imu, optical = result.imu, result.optical
-    if imu is None:
+    if imu is None or result.provenance.settings.get("camera", "static") == "imu":
         return None
     usable = np.isfinite(imu.gyro_radps).all(axis=1)
     good = np.isfinite(optical.R_camera_brick).all(axis=(1, 2))
