@@ -13,10 +13,13 @@ from playwright.sync_api import Error, sync_playwright
 from small_lab import BRICK, UNITS, example, invented_run
 
 from bricktrack_host.assemblies.combined_test import combine_test
+from bricktrack_host.datasets.comparison_pairs import compare
 from bricktrack_host.reporting.combined_interactive import write_interactive_test
 from bricktrack_host.reporting.combined_report import write_combined_report
+from bricktrack_host.reporting.comparison_report import write_comparison_page
 from bricktrack_host.reporting.interactive_report import write_interactive_report
 from bricktrack_host.reporting.report import write_report
+from bricktrack_host.results.result_store import write_results
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -29,7 +32,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """The four kinds of pages of two invented runs and their test."""
+    """The kinds of pages of two invented runs and their test."""
     lab = tmp_path_factory.mktemp("lab")
     results = {}
     for unit in UNITS:
@@ -40,7 +43,10 @@ def pages(tmp_path_factory):
     test = lab / "shake-12"
     combine_test("shake-12", results, [BRICK], test, also=write_combined_report)
     write_interactive_test(test)
+    write_results(example.example_result(seed=2), lab / "other")
+    write_comparison_page(compare(lab / "other", results["b7-2"]), lab / "comparison.html")
     return {
+        "comparison": lab / "comparison.html",
         "run": results["b7-2"] / "report.html",
         "run, interactive": results["b7-2"] / "interactive.html",
         "test": test / "report.html",
@@ -107,7 +113,7 @@ def window(browser, pages):
         one.context.close()
 
 
-@pytest.mark.parametrize("kind", ["run", "run, interactive", "test", "test, interactive"])
+@pytest.mark.parametrize("kind", ["run", "run, interactive", "test", "test, interactive", "comparison"])
 def test_every_page_is_whole_without_a_network(window, kind):
     shown = window(kind)
     assert shown.asked == []
