@@ -280,25 +280,16 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
     return section
 
 
+_UNITS = dict.fromkeys(("ms", "us", "ns", "s", "ppm", "um", "mm", "px", "deg")) | {
+    "hz": "Hz", "mps2": "m/s²", "radps": "rad/s", "dps": "deg/s",
+}  # fmt: skip
+
+
 def in_words(name: str) -> str:
-    """Return a key as words, its unit behind a comma: ``offset_ms`` as ``offset, ms``."""
+    """Return a key as words, its unit behind a comma: ``acc_bias_mps2`` as ``acc bias, m/s²``."""
     words, _, unit = name.rpartition("_")
-    if words and unit in {
-        "ms",
-        "us",
-        "ns",
-        "s",
-        "ppm",
-        "um",
-        "mm",
-        "px",
-        "hz",
-        "deg",
-        "mps2",
-        "radps",
-        "dps",
-    }:
-        return f"{words.replace('_', ' ')}, {unit}"
+    if words and unit in _UNITS:
+        return f"{words.replace('_', ' ')}, {_UNITS[unit] or unit}"
     return name.replace("_", " ")
 
 
@@ -309,7 +300,7 @@ def value_text(value: DetailValue) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.6g}"
+        return f"{value:.4g}"
     if isinstance(value, list):
         return ", ".join(value_text(v) for v in value)
     return str(value)
