@@ -293,6 +293,19 @@ def test_columns_are_only_ever_added():
     assert len(words) == 35
 
 
+def test_a_dataset_of_version_1_stays_readable():
+    """A file of thirteen rows (simulated), as version 1 wrote it: it is never made again."""
+    root = DOCS.parent / "tests" / "data" / "campaign-v1"
+    [entry] = list_units(root)
+    assert (entry.test, entry.assembly, entry.unit) == ("shake-12", "brick-7", "b7-2")
+    assert (entry.version, entry.rows, entry.components, entry.simulated) == (1, 13, ["C"], True)
+    rows = rows_of(root).to_pylist()
+    assert [row["sample"] for row in rows if row["kind"] == "edge"] == [*range(1248, 1254), 1248, 1250, 2999]
+    assert rows[0]["dx_mm"] == 1.817352258557508
+    assert (rows[10]["component"], rows[10]["dx_mm"]) == ("C", 5.521495384433408)
+    assert (rows[12]["measured"], rows[12]["flag_words"]) == (False, "extrapolated")
+
+
 def test_a_file_of_an_older_version_reads_with_nulls_in_what_it_lacks(campaign, tmp_path):
     root = tmp_path / "campaign"
     shutil.copytree(campaign, root)
