@@ -43,8 +43,8 @@ def normalised(run, track):
 
 @pytest.mark.slow
 def test_at_full_speed_the_error_stays_well_below_the_pose_level_one():
-    # Poses whose twist was held constant within a frame gave 0.30 mm here, four times ours; with a twist that may
-    # change (0.12 mm) what is left to gain is the dropouts and the frames with few LEDs.
+    # Over eight seeds half the pose-level error, the limit of whatever takes poses (scripts/bench_tight.py); two seeds
+    # scatter about that.
     tight, poses, covered, speeds = [], [], [], []
     for seed in (13, 15):
         run = simulate_run(
