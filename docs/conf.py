@@ -42,6 +42,7 @@ napoleon_use_rtype = False
 copybutton_prompt_text = "$ "
 copybutton_line_continuation_character = "\\"
 
+html_search_scorer = str(Path(__file__).parent / "_search" / "scorer.js")
 html_theme = "furo"
 html_title = "bricktrack"
 html_copy_source = False
