@@ -40,6 +40,9 @@ def alignment_details(
             "camera_sensor_method": "motion" if own.source == "data" else "stamps",
         }
     if fusion is not None:
+        # Between two sensors gravity falls out; what is left in its place is the difference of their biases.
+        is_still = inertial.camera is None
+        gravity = "gravity_camera_mps2" if is_still else "acc_bias_less_camera_sensors_mps2"
         details |= {
             "smoothed_offset_ms": fusion.offset_ns / 1e6,
             "smoothed_offset_sd_ms": fusion.offset_sd_ns / 1e6,
@@ -47,7 +50,7 @@ def alignment_details(
             "acc_lag_ms": fusion.acc_lag_ns / 1e6,
             "gyro_bias_dps": np.rad2deg(fusion.gyro_bias_radps).tolist(),
             "acc_bias_mps2": fusion.acc_bias_mps2.tolist(),
-            "gravity_camera_mps2": fusion.gravity_camera_mps2.tolist(),
+            gravity: fusion.gravity_camera_mps2.tolist(),
             "mean_nis": fusion.mean_nis,
         }
         details |= _chip_details(inertial, fusion, optical)
