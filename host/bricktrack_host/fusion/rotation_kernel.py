@@ -11,8 +11,9 @@ from bricktrack_host.compiled import compiled
 def write_rotation(v: Any, out: Any) -> None:
     """Write Exp of a rotation vector."""
     a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    if a2 < 1e-8:
-        s, c = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0
+    if a2 < 0.01:  # the next terms are below 1e-17
+        s = 1.0 - a2 / 6.0 * (1.0 - a2 / 20.0 * (1.0 - a2 / 42.0 * (1.0 - a2 / 72.0)))
+        c = 0.5 - a2 / 24.0 * (1.0 - a2 / 30.0 * (1.0 - a2 / 56.0 * (1.0 - a2 / 90.0)))
     else:
         a = np.sqrt(a2)
         s, c = np.sin(a) / a, (1.0 - np.cos(a)) / a2

@@ -123,7 +123,7 @@ class Estimate:
     of : ndarray of int64, shape (c,)
         By default `SEEN`: the whole would be 4 kB a node.
     variance : ndarray, shape (K, B, 22)
-        Of every state.
+        Of every state; of those not in ``of``, that at one of the next 16 nodes.
     nis : ndarray, shape (K, B)
         Innovation squared over its covariance (6 degrees of freedom), NaN where no frame; only of the filter.
     led_residual_px, led_cov_px2 : ndarray, shape (m, 2), (m, 2, 2)

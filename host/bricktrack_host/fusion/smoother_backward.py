@@ -26,6 +26,8 @@ from bricktrack_host.fusion.smoother_kernel import (
     transition,
 )
 
+_WHOLE_EVERY = 16  # nodes: biases and gravity are as unsure at the next
+
 
 @compiled
 def _before_measurement(kept: Kept, m: int, gradient: Any, hessian: Any, work: Any) -> None:
@@ -91,29 +93,43 @@ def _before_step(F: Any, gradient: Any, hessian: Any, work: Any) -> None:
     for i in range(M):
         for c in range(N_COLUMNS[i]):
             gradient[COLUMNS[i, c]] += F[i, COLUMNS[i, c]] * moving[i]
-    for r in range(N):  # rounding alone tells them apart
-        for j in range(r):
-            mean = 0.5 * (hessian[r, j] + hessian[j, r])
-            hessian[r, j] = mean
-            hessian[j, r] = mean
+    _make_symmetric(hessian)
 
 
 @compiled
-def _smoothed(P: Any, hessian: Any, work: Any, out: Any) -> None:
-    """Write P - P hessian P."""
-    for r in range(N):
+def _dot(a: Any, b: Any) -> float:
+    """Return the product of two states, two sums at a time: one alone would wait for itself."""
+    even, odd = 0.0, 0.0
+    for j in range(0, N, 2):
+        even += a[j] * b[j]
+        odd += a[j + 1] * b[j + 1]
+    return even + odd
+
+
+@compiled
+def _smoothed(rows: Any, hessian: Any, work: Any, out: Any) -> None:
+    """Write what later frames take from a covariance: rows hessian rows^T, for some rows of P, or of H P."""
+    n = len(rows)
+    for r in range(n):
         work[r] = 0.0
         for m in range(N):
-            p = P[r, m]
+            p = rows[r, m]
             for j in range(N):
                 work[r, j] += p * hessian[m, j]
-    for r in range(N):
+    for r in range(n):
         for j in range(r + 1):
-            s = 0.0
-            for m in range(N):
-                s += work[r, m] * P[j, m]
-            out[r, j] = P[r, j] - s
+            out[r, j] = _dot(work[r], rows[j])
             out[j, r] = out[r, j]
+
+
+@compiled
+def _make_symmetric(A: Any) -> None:
+    """Replace both halves by their mean: rounding alone tells them apart."""
+    for r in range(N):
+        for j in range(r):
+            mean = 0.5 * (A[r, j] + A[j, r])
+            A[r, j] = mean
+            A[j, r] = mean
 
 
 @compiled
@@ -148,6 +164,7 @@ def backward_pass(
     of : ndarray of int64, shape (c,)
         The states whose covariance is written.
     R_out, x_out, variance, covariance : ndarray, shape (K, 3, 3), (K, 22), (K, 22), (K, c, c)
+        The variance of states that are not asked for is that of a node at most 16 later.
     led_residual_px, led_cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
         Of each LED at the state of its node, and H P H^T.
     """
@@ -156,6 +173,7 @@ def backward_pass(
     R, x, P = np.empty((3, 3)), np.empty(N), np.empty((N, N))
     F, H, y = np.zeros((M, N)), np.zeros((2, N)), np.zeros(2)
     gradient, hessian, work = np.zeros(N), np.zeros((N, N)), np.empty((N, N))
+    rows, HP, taken = np.empty((len(of), N)), np.empty((2, N)), np.zeros((N, N))
     nis, inflation = np.empty(n_nodes), np.empty(n_nodes)
     for c in range(len(R_before) - 1, -1, -1):
         start, stop = c * CHUNK, min((c + 1) * CHUNK, n_nodes)
@@ -167,33 +185,45 @@ def backward_pass(
             R[:], x[:] = kept.R[i], kept.x[i]
             if is_smoothed:
                 dx = np.zeros(N)
-                for r in range(N):
-                    for j in range(N):
-                        dx[r] -= kept.P[i, r, j] * gradient[j]
+                for j in range(N):
+                    for r in range(N):
+                        dx[r] -= kept.P[i, j, r] * gradient[j]
                 turn_by(R, dx[:3])
                 for r in range(3, N):
                     x[r] += dx[r]
-                _smoothed(kept.P[i], hessian, work, P)
-            else:
-                P[:] = kept.P[i]
             R_out[k], x_out[k] = R, x
-            for r in range(N):
-                variance[k, r] = P[r, r]
+            for r in range(len(of)):
+                rows[r] = kept.P[i, of[r]]
+            if is_smoothed:
+                _smoothed(rows, hessian, work, taken)
             for r in range(len(of)):
                 for j in range(len(of)):
-                    covariance[k, r, j] = P[of[r], of[j]]
+                    covariance[k, r, j] = rows[r, of[j]] - taken[r, j]
+            if k == n_nodes - 1 or k % _WHOLE_EVERY == 0:
+                if is_smoothed:
+                    _smoothed(kept.P[i], hessian, work, P)
+                for r in range(N):
+                    variance[k, r] = kept.P[i, r, r] - (P[r, r] if is_smoothed else 0.0)
+            else:
+                variance[k] = variance[k + 1]
+            for r in range(len(of)):
+                variance[k, of[r]] = covariance[k, r, r]
             for led in range(leds.first[k, 0], leds.first[k + 1, 0]):
                 observe_led(
                     leds, led, R, x, run.arm_m, run.bg_lin, run.off_lin, run.tau_lin, run.skew_lin, H, y
                 )
                 led_residual_px[led] = y
                 for r in range(2):
+                    HP[r] = 0.0
+                    for p in range(N):
+                        h = H[r, p]
+                        for q in range(N):
+                            HP[r, q] += h * kept.P[i, p, q]
+                if is_smoothed:
+                    _smoothed(HP, hessian, work, taken)
+                for r in range(2):
                     for j in range(2):
-                        s = 0.0
-                        for p in range(N):
-                            for q in range(N):
-                                s += H[r, p] * P[p, q] * H[j, q]
-                        led_cov_px2[led, r, j] = s
+                        led_cov_px2[led, r, j] = _dot(HP[r], H[j]) - taken[r, j]
             if not is_smoothed:
                 continue
             for m in range(kept.first[i + 1] - 1, kept.first[i] - 1, -1):
