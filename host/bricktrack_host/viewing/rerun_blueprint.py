@@ -7,11 +7,15 @@ from bricktrack_host.viewing.rerun_recording import CAMERA
 _WINDOW_S = 2.0
 
 
-def run_blueprint(timeline: str) -> "rrb.Blueprint":
-    """Return the arrangement; the curves show what is around the instant that the time panel is at."""
+def run_blueprint(timeline: str, *, with_camera: bool) -> "rrb.Blueprint":
+    """Return the arrangement; the curves show what is around the instant that the time panel is at.
+
+    Without a camera in space, ``with_camera``, the picture has no place there.
+    """
     space = rrb.Spatial3DView(
         origin="world",
-        name="Brick, rays and camera",
+        contents=["$origin/**"] if with_camera else ["$origin/**", f"- /{CAMERA}/**"],
+        name="Brick, rays and camera" if with_camera else "Brick",
         eye_controls=rrb.EyeControls3D(position=[190, -130, -60], look_target=[0, 0, 130], eye_up=[0, -1, 0]),
         line_grid=False,
     )

@@ -41,7 +41,7 @@ def save_recording(
         partial.write_bytes(b"")  # what is wrong with the place is said by the system's own error
         try:
             stream = _stream(result)
-            stream.save(partial, default_blueprint=run_blueprint(timeline_of(result)))
+            stream.save(partial, default_blueprint=_arranged(result, belongings))
             record_run(stream, run, result, belongings, with_video=with_video, progress=progress)
             stream.disconnect()
             sync_file(partial)
@@ -73,9 +73,13 @@ def show_recording(
             "another computer with 'rerun run.rrd'"
         )
     stream = _stream(result)
-    stream.spawn(default_blueprint=run_blueprint(timeline_of(result)))
+    stream.spawn(default_blueprint=_arranged(result, belongings))
     record_run(stream, run, result, belongings, with_video=with_video, progress=progress)
     stream.disconnect()
+
+
+def _arranged(result: RunResult, belongings: Belongings) -> "rr.blueprint.Blueprint":
+    return run_blueprint(timeline_of(result), with_camera=belongings.rays is not None)
 
 
 def _stream(result: RunResult) -> "rr.RecordingStream":
