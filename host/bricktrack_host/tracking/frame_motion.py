@@ -20,8 +20,6 @@ _MAX_GAP_PERIODS = 3.5  # wider gaps end a spline: a shaken brick turns back wit
 _SPLINE_SHARE = 0.1
 _TWIST_FLOOR = np.array([0.005, 0.3])  # rad/s, mm/s: far below what moves a centroid within a frame
 _FUSED_TWIST_SD = np.repeat([0.03, 5.0], 3)  # rad/s, mm/s: of the fused motion between frames
-_JUMP_SHARE = 0.29  # sd of a moment anywhere within an interval, over its length: 1 / sqrt(12)
-_MIN_APART_S = 1e-3  # of an LED's instant and its frame's, for a velocity between them
 _UNKNOWN_TWIST = np.array([1.0, 1.0, 1.0, 300.0, 300.0, 300.0])
 """Of a shaken brick (DESIGN 2: 0.3 m/s), where the neighbours do not say."""
 
@@ -119,6 +117,7 @@ def carried_px(
 
 def motion_doubt_px2(
     motion: LedMotion,
+    twist_sd: FloatArray,
     poses: RefinedPoses,
     frames: IntArray,
     ray_model: RayModel,
@@ -126,11 +125,12 @@ def motion_doubt_px2(
     *,
     collar_mm: float | None,
 ) -> FloatArray:
-    """Return how far an impact within a frame may put each LED from where the motion has it.
+    """Return what a doubtful twist leaves of each LED's place, each for itself.
 
     Parameters
     ----------
     motion : LedMotion
+    twist_sd : ndarray, shape (m, 6), rad/s and mm/s
     poses : RefinedPoses
     frames : ndarray of int64, shape (m,)
         Those wanted; they have poses.
@@ -139,24 +139,7 @@ def motion_doubt_px2(
     -------
     covariance_px2 : ndarray, shape (m, n_leds, 2, 2), px^2
         Zero for an LED seen at the frame's own instant.
-
-    Notes
-    -----
-    A velocity that jumps by dv at an unknown moment within the IMU's 10 ms, or a frame's read-out, leaves the
-    path between known ends off by `_JUMP_SHARE` dv dt. The jump is the range of the motion's velocities
-    within the frame, and no less than what the twist is doubted by.
     """
-    dt = motion.dt_s[frames]
-    long_enough = np.abs(dt) > _MIN_APART_S
-    with np.errstate(invalid="ignore", divide="ignore"):
-        pace = np.concatenate([motion.rvec_brick_rad[frames], motion.shift_camera_mm[frames]], axis=2)
-        pace = np.where(long_enough[..., None], pace / dt[..., None], np.nan)
-    jump = np.zeros((len(frames), 6))
-    some = long_enough.sum(axis=1) >= 2
-    jump[some] = np.nanmax(pace[some], axis=1) - np.nanmin(pace[some], axis=1)
-    sd = np.repeat(np.linalg.norm(jump.reshape(-1, 2, 3), axis=2), 3, axis=1) * _JUMP_SHARE
-    if motion.twist_sd is not None:
-        sd = np.maximum(sd, motion.twist_sd[frames])
     _, J = predict_brick(
         poses.R_camera_brick[frames],
         poses.t_camera_brick_mm[frames],
@@ -164,7 +147,7 @@ def motion_doubt_px2(
         brick_model,
         collar_mm=collar_mm,
     )
-    by_twist = J * (dt[..., None] * sd[:, None])[:, :, None, :]
+    by_twist = J * (motion.dt_s[frames][..., None] * twist_sd[:, None])[:, :, None, :]
     return np.asarray(by_twist @ np.swapaxes(by_twist, -1, -2))
 
 

@@ -7,6 +7,8 @@ splines cannot follow, an impact or the shake's upper frequencies, is corrected 
 are 20 ms of motion, and pose and twist are fitted together, with the splines' twist as a prior.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
@@ -101,17 +103,25 @@ def solve_poses(
     flags[first.is_ambiguous] |= PoseFlag.AMBIGUOUS
     uv, R, t_mm = first.uv_px, first.R_camera_brick, first.t_camera_brick_mm
     known_motion = motion
-    torn = np.zeros(n, dtype=np.bool_)
+    torn, twist_doubt = np.zeros(n, dtype=np.bool_), np.zeros((n, 6))
     for _ in range(_PASSES):
         if rolling_shutter and known_motion is None:
             motion = motion_to_leds(t_ns, led_t_ns, R, t_mm)
         n_before, n_torn = int(all_finite(uv).sum()), int(torn.sum())
+        if motion is not None and motion.twist_sd is not None:
+            motion = replace(motion, twist_sd=np.maximum(motion.twist_sd, twist_doubt))
         poses = fit(uv, R, t_mm, motion)
         newly = np.flatnonzero(_misfits(poses, uv) & ~torn) if motion is not None else _NO_FRAMES
         if motion is not None and newly.size:
-            more = motion_doubt_px2(motion, poses, newly, ray_model, brick_model, collar_mm=collar_mm)
+            # Whatever motion was given, what a spline through the frames cannot follow here is in doubt.
+            spline = motion if known_motion is None else motion_to_leds(t_ns, led_t_ns, R, t_mm)
+            twist_sd = np.zeros((newly.size, 6)) if spline.twist_sd is None else spline.twist_sd[newly]
+            more = motion_doubt_px2(
+                motion, twist_sd, poses, newly, ray_model, brick_model, collar_mm=collar_mm
+            )
             moving = np.einsum("nlii->n", more) > np.einsum("nlii->n", np.nan_to_num(cov[newly]))
             cov[newly[moving]] += more[moving]
+            twist_doubt[newly[moving]] = twist_sd[moving]
             torn[newly[moving]] = True
             uv = np.where(torn[:, None, None], first.uv_px, uv)
         uv = _without_outliers(uv, poses, ~torn)
