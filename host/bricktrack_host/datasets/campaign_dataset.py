@@ -1,67 +1,48 @@
-"""The dataset of a campaign on disk: a file for each test, assembly and unit, added whole or not at all.
+"""The dataset of a campaign: one Parquet file for each test, assembly and unit; added to, opened, listed.
 
-    campaign/
-        dataset.json                                       schema and version
-        motion/test=T/assembly=A/unit=U/motion.parquet     what was added last
-        earlier/test=T/assembly=A/unit=U/1-<id>.parquet    what stood there before, never deleted
-
-What is to be added is first written aside and synced; one rename then decides, and each file is put into its
-place by another. After a kill behind the decision the next command of any kind does the rest.
 `docs/dataset-format.md` describes the format.
 """
 
-import fcntl
 import json
-import os
 import re
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import pyarrow as pa
 import pyarrow.dataset
 import pyarrow.parquet
 
-from bricktrack_common.errors import ConfigError, RunFormatError, StorageError
-from bricktrack_common.typed_data import convert, dump_json, load_json
+from bricktrack_common.errors import ConfigError, RunFormatError
+from bricktrack_host.datasets.campaign_folder import (
+    EARLIER_FOLDER,
+    FILE_NAME,
+    MOTION_FOLDER,
+    STAGED,
+    decide,
+    earlier_files,
+    footer_of,
+    locked,
+    recover,
+    require_dataset,
+    source_in,
+)
 from bricktrack_host.datasets.motion_rows import UnitSource, identity_of, unit_rows
 from bricktrack_host.datasets.motion_schema import (
     MOTION_SCHEMA,
-    MOTION_VERSION,
     PARTITION_KEYS,
     motion_schema,
     partition_schema,
     require_known_version,
 )
-from bricktrack_host.durable_files import (
-    rename_durably,
-    storage_errors,
-    sync_file,
-    sync_folder,
-    write_durably,
-)
+from bricktrack_host.durable_files import storage_errors, sync_file
 from bricktrack_host.results.result_store import read_result
 
-MARKER_NAME = "dataset.json"
-MOTION_FOLDER = "motion"
-EARLIER_FOLDER = "earlier"
-FILE_NAME = "motion.parquet"
 NULL_PARTITION = "__HIVE_DEFAULT_PARTITION__"
 KEY_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}"
 
-_STAGED = ".adding"
-_DECIDED = ".decided"
-_RETIRE_NAME = "retire.json"
 
 Progress = Callable[[str, int, int], None]
-
-
-class _Marker(msgspec.Struct, frozen=True, kw_only=True):
-    schema: str = MOTION_SCHEMA
-    version: int = MOTION_VERSION
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,18 +130,18 @@ def add_units(
     """
     say = progress or (lambda _what, _done, _of: None)
     places = _places(sources)
-    with _locked(root):
+    with locked(root):
         before = {place: root / MOTION_FOLDER / place / FILE_NAME for place in places}
         identities = {}
         for i, (place, source) in enumerate(places.items()):
             say("comparing", i, len(places))
             identities[place] = identity_of(source)
-        unchanged = [place for place in places if _source_in(before[place]) == identities[place]]
+        unchanged = [place for place in places if source_in(before[place]) == identities[place]]
         wanted = {place: source for place, source in places.items() if place not in unchanged}
         retired = _not_in(root, places, whole_tests=whole_tests)
         if not whole_tests:
             _require_nothing_lost(before, wanted, retired)
-        staged = root / _STAGED
+        staged = root / STAGED
         with storage_errors(root, "The dataset cannot be written; make room"):
             staged.mkdir()
             for i, (place, source) in enumerate(wanted.items()):
@@ -169,13 +150,8 @@ def add_units(
                 path.parent.mkdir(parents=True)
                 pa.parquet.write_table(unit_rows(source, identities[place]), path, compression="zstd")
                 sync_file(path)
-            write_durably(staged / _RETIRE_NAME, json.dumps(retired).encode())
-            for folder in [path for path in staged.rglob("*") if path.is_dir()]:
-                sync_folder(folder)
-            sync_folder(staged)
             replaced = [place for place in wanted if before[place].is_file()]
-            rename_durably(staged, root / _DECIDED)
-            _finish(root)
+            decide(root, retired)
     return AddedUnits(
         added=[_words(place) for place in wanted if place not in replaced],
         replaced=[_words(place) for place in replaced],
@@ -195,8 +171,8 @@ def open_dataset(root: Path, *, earlier: bool = False) -> "pa.dataset.Dataset":
     RunFormatError
         If there is no dataset, or it is of a newer version.
     """
-    _require_dataset(root)
-    _recover(root)
+    require_dataset(root)
+    recover(root)
     schema = motion_schema()
     for key in partition_schema():
         schema = schema.append(key)
@@ -217,8 +193,8 @@ def list_units(root: Path, *, progress: Progress | None = None) -> list[UnitEntr
         If there is no dataset, it is of a newer version, or a file is damaged.
     """
     say = progress or (lambda _what, _done, _of: None)
-    _require_dataset(root)
-    _recover(root)
+    require_dataset(root)
+    recover(root)
     paths = sorted((root / MOTION_FOLDER).rglob(FILE_NAME))
     entries = []
     for i, path in enumerate(paths):
@@ -229,7 +205,7 @@ def list_units(root: Path, *, progress: Progress | None = None) -> list[UnitEntr
 
 def _entry(root: Path, path: Path) -> UnitEntry:
     place = path.parent.relative_to(root / MOTION_FOLDER).as_posix()
-    footer = _footer(path)
+    footer = footer_of(path)
     facts = {key.decode(): value.decode() for key, value in (footer.metadata or {}).items()}
     try:
         test, assembly, unit = (part.split("=", 1)[1] for part in place.split("/"))
@@ -246,28 +222,12 @@ def _entry(root: Path, path: Path) -> UnitEntry:
             size_bytes=path.stat().st_size,
             components=list(json.loads(facts["bricktrack.chains"])),
             problems=list(json.loads(facts["bricktrack.problems"])),
-            earlier=len(_earlier_files(root, place)),
+            earlier=len(earlier_files(root, place)),
         )
     except (KeyError, ValueError, IndexError) as e:
         if isinstance(e, RunFormatError):
             raise
         raise RunFormatError(f"{path}: not of a {MOTION_SCHEMA} dataset: {e}") from e
-
-
-def _footer(path: Path) -> "pa.parquet.FileMetaData":
-    try:
-        return pa.parquet.read_metadata(path)
-    except (OSError, pa.ArrowException) as e:
-        raise RunFormatError(
-            f"{path}: not a readable Parquet file: {e}. Remove it, then add the run again"
-        ) from e
-
-
-def _source_in(path: Path) -> str | None:
-    """Return the `source_id` of what a file was made of; `None` where there is no file."""
-    if not path.is_file():
-        return None
-    return (_footer(path).metadata or {}).get(b"bricktrack.source", b"").decode()
 
 
 def _require_nothing_lost(before: dict[str, Path], wanted: dict[str, UnitSource], others: list[str]) -> None:
@@ -280,7 +240,7 @@ def _require_nothing_lost(before: dict[str, Path], wanted: dict[str, UnitSource]
     for place, source in wanted.items():
         if not before[place].is_file():
             continue
-        there = (_footer(before[place]).metadata or {}).get(b"bricktrack.run_id", b"").decode()
+        there = (footer_of(before[place]).metadata or {}).get(b"bricktrack.run_id", b"").decode()
         run_id = read_result(source.results).manifest.run_id
         if run_id != there:
             raise ConfigError(
@@ -326,112 +286,3 @@ def _not_in(root: Path, places: dict[str, UnitSource], *, whole_tests: bool) -> 
             if place not in places and (whole_tests or unit in units):
                 found.append(place)
     return found
-
-
-def _require_dataset(root: Path) -> None:
-    path = root / MARKER_NAME
-    if not path.is_file():
-        raise RunFormatError(f"{root}: no {MARKER_NAME}: no dataset. Make it with 'bricktrack dataset add'")
-    head = load_json(path, dict[str, object])
-    if head.get("schema") != MOTION_SCHEMA:
-        raise RunFormatError(f"{path}: not a {MOTION_SCHEMA} dataset")
-    require_known_version(convert(head, _Marker, where=str(path), error=RunFormatError).version, path)
-
-
-@contextmanager
-def _locked(root: Path) -> Iterator[None]:
-    """Hold the dataset alone, made if there is none, with what a kill left undone put right."""
-    if root.exists() and not (root / MARKER_NAME).is_file() and any(root.iterdir()):
-        raise StorageError(
-            f"{root} exists and holds no {MARKER_NAME}; it is left alone. Choose another folder"
-        )
-    with storage_errors(root, "The dataset cannot be written; make room, or choose another folder"):
-        (root / MOTION_FOLDER).mkdir(parents=True, exist_ok=True)
-        handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as e:
-            raise StorageError(
-                f"{root}: another command adds to this dataset. Wait for it, or stop it"
-            ) from e
-        with storage_errors(root, "The dataset cannot be written; make room"):
-            if not (root / MARKER_NAME).is_file():
-                partial = root / f".{MARKER_NAME}.partial"
-                partial.unlink(missing_ok=True)
-                write_durably(partial, dump_json(_Marker()))
-                rename_durably(partial, root / MARKER_NAME)
-            _require_dataset(root)
-            _finish(root)
-            if (root / _STAGED).exists():
-                shutil.rmtree(root / _STAGED)
-        yield
-    finally:
-        os.close(handle)
-
-
-def _recover(root: Path) -> None:
-    """Finish what a kill has left decided and not done; a dataset that cannot be written is left as it is."""
-    if (root / _DECIDED).exists() and os.access(root, os.W_OK):
-        with _locked(root):
-            pass
-
-
-def _finish(root: Path) -> None:
-    """Put decided files into their places, and what they replace or retire among the earlier ones."""
-    decided = root / _DECIDED
-    if not decided.exists():
-        return
-    motion = root / MOTION_FOLDER
-    for place in json.loads((decided / _RETIRE_NAME).read_bytes()):
-        path = motion / place / FILE_NAME
-        if path.is_file():
-            _keep(root, place)
-            path.unlink()
-            sync_folder(path.parent)
-            _remove_empty(path.parent, motion)
-    for path in sorted(decided.rglob(FILE_NAME)):
-        place = path.parent.relative_to(decided).as_posix()
-        target = motion / place / FILE_NAME
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if target.is_file():
-            _keep(root, place)
-        path.replace(target)
-        _sync_up(target.parent, root)
-    shutil.rmtree(decided)
-    sync_folder(root)
-
-
-def _keep(root: Path, place: str) -> None:
-    """Copy a file among the earlier ones, unless the last of them is the same."""
-    path = root / MOTION_FOLDER / place / FILE_NAME
-    there = _earlier_files(root, place)
-    identity = _source_in(path)
-    if there and _source_in(there[-1]) == identity:
-        return
-    folder = root / EARLIER_FOLDER / place
-    folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / ".partial"
-    shutil.copyfile(path, partial)
-    sync_file(partial)
-    rename_durably(partial, folder / f"{len(there) + 1}-{identity}.parquet")
-    _sync_up(folder, root)
-
-
-def _earlier_files(root: Path, place: str) -> list[Path]:
-    folder = root / EARLIER_FOLDER / place
-    paths = folder.glob("*.parquet") if folder.is_dir() else ()
-    return sorted(paths, key=lambda path: int(path.name.split("-")[0]))
-
-
-def _sync_up(folder: Path, root: Path) -> None:
-    """Make a folder's names durable, and its own and those above it in the dataset."""
-    while folder != root.parent:
-        sync_folder(folder)
-        folder = folder.parent
-
-
-def _remove_empty(folder: Path, stop: Path) -> None:
-    while folder != stop and not any(folder.iterdir()):
-        folder.rmdir()
-        folder = folder.parent

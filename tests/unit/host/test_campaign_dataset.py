@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from bricktrack_common.errors import ConfigError, RunFormatError, StorageError
 from bricktrack_host.assemblies.combined_test import combine_test, read_components
 from bricktrack_host.cli.main import app
-from bricktrack_host.datasets import campaign_dataset as store
+from bricktrack_host.datasets import campaign_dataset, campaign_folder
 from bricktrack_host.datasets.campaign_dataset import add_units, list_units, open_dataset
 from bricktrack_host.datasets.motion_schema import COLUMNS, MOTION_VERSION, columns_of, motion_schema
 from bricktrack_host.datasets.test_sources import source_of_run, sources_of_test
@@ -192,7 +192,8 @@ def test_a_kill_at_any_step_leaves_the_dataset_as_before_or_as_after(
     shutil.copytree(slipped, root)
     sources = sources_of_test(lab / "shake-12")
     before, after = (rows_of(folder).column("sample").to_numpy() for folder in (slipped, campaign))
-    real, calls = getattr(store, step), []
+    module = campaign_dataset if step == "unit_rows" else campaign_folder
+    real, calls = getattr(module, step), []
 
     def dies(*words, **options):
         calls.append(1)
@@ -201,7 +202,7 @@ def test_a_kill_at_any_step_leaves_the_dataset_as_before_or_as_after(
         return real(*words, **options)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(store, step, dies)
+        patch.setattr(module, step, dies)
         add_units(root, sources, whole_tests=True)
     # Adding begins with a call of _finish; its first rename decides.
     is_decided = step in ("_keep", "_sync_up") or (step, call) in (("_finish", 2), ("rename_durably", 2))
@@ -274,7 +275,7 @@ def test_a_folder_of_something_else_and_a_busy_dataset_are_refused(lab, tmp_path
     with pytest.raises(RunFormatError, match="no dataset"):
         open_dataset(tmp_path)
     root = tmp_path / "campaign"
-    with store._locked(root), pytest.raises(StorageError, match="another command adds"):
+    with campaign_folder.locked(root), pytest.raises(StorageError, match="another command adds"):
         add_units(root, sources_of_test(lab / "shake-12"), whole_tests=True)
 
 
