@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-virtual-camera check bench docs format constraints clean help
+.PHONY: setup demo test test-virtual-camera check bench docs format constraints clean help
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 24
@@ -17,6 +17,8 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
 	    -e '.[device,sim,host,dashboard,scale,analysis,view]' --group dev
 	@touch $@
+
+setup: $(READY)  ## make the virtual environment .venv, and no more
 
 demo: $(READY)  ## record a simulated brick with the real daemon, pull it, process it, open the report
 	$(BIN)/bricktrack demo --folder demo
