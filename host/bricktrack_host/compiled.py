@@ -3,22 +3,32 @@
 Numba keeps the code of each function under the time stamp of its own file, and would go on using it after a
 change in another file that the function calls into. So the code is kept in a folder named after what the
 function's module holds, and all modules of ours that it imports from, and so on: a change compiles anew what
-it can reach, once, and nothing else.
+it can reach, once, and nothing else. Of several processes that need the same code one compiles it; the others
+wait, and load it.
 """
 
 import hashlib
+import logging
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 from numba import njit
+from numba.core.compiler_lock import global_compiler_lock
 
 import bricktrack_common
 
+try:
+    import fcntl
+except ImportError:  # not on Windows, where each process compiles for itself
+    fcntl = None  # type: ignore[assignment]
+
+logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 _ROOT = Path(os.environ.get("NUMBA_CACHE_DIR") or Path.home() / ".cache" / "bricktrack" / "compiled")
@@ -35,8 +45,7 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     Division by zero gives infinity or NaN, as in numpy. The first call on a machine compiles; the code is
     kept in the user's cache folder, or in ``NUMBA_CACHE_DIR``.
     """
-    numba.config.CACHE_DIR = str(_folder(function.__code__.co_filename))  # type: ignore[attr-defined]
-    return cast(Callable[_P, _R], njit(cache=True, nogil=True, error_model="numpy")(function))
+    return _kept(function)
 
 
 def compiled_in_place(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -45,9 +54,57 @@ def compiled_in_place(function: Callable[_P, _R]) -> Callable[_P, _R]:
     They then need no counts of who holds them, whose atomic changes cost small kernels a third of their
     time.
     """
-    numba.config.CACHE_DIR = str(_folder(function.__code__.co_filename))  # type: ignore[attr-defined]
-    made = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
-    return cast(Callable[_P, _R], made(function))
+    return _kept(function, _nrt=False)
+
+
+def _kept(function: Callable[_P, _R], **options: bool) -> Callable[_P, _R]:
+    folder = _folder(function.__code__.co_filename)
+    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+    made: Any = njit(cache=True, nogil=True, error_model="numpy", **options)  # type: ignore[call-overload]
+    dispatcher = made(function)
+    dispatcher.compile = _one_at_a_time(dispatcher.compile, folder, function.__qualname__)
+    return cast(Callable[_P, _R], dispatcher)
+
+
+def _one_at_a_time(compile_for: Callable[[Any], Any], folder: Path, name: str) -> Callable[[Any], Any]:
+    """Return a dispatcher's compilation, of which there is one at a time among processes.
+
+    The lock of the process is taken before that between processes, by everyone, and a function's before those
+    of the functions that it calls: nobody waits in a circle.
+    """
+
+    def compile_or_load(signature: Any) -> Any:
+        with global_compiler_lock:
+            if not any(folder.rglob("*.nbi")):  # what numba calls its lists of what it keeps
+                _say_once()
+            with _lock_between_processes(folder / f"{name}.lock"):
+                return compile_for(signature)
+
+    return compile_or_load
+
+
+@cache
+def _say_once() -> None:
+    logger.warning(
+        "compiling the numerical loops for this machine, about a minute in all; kept in %s, so only once",
+        _ROOT,
+    )
+
+
+@contextmanager
+def _lock_between_processes(path: Path) -> Iterator[None]:
+    """Hold a lock on a file while the block runs; where there can be none, go on without."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("w")
+    except OSError:
+        yield
+        return
+    with file:
+        if fcntl is not None:
+            with suppress(OSError):  # some network file systems have no locks
+                fcntl.flock(file, fcntl.LOCK_EX)  # given back when the file is closed
+        yield
 
 
 def _folder(filename: str) -> Path:

@@ -1,3 +1,5 @@
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -45,3 +47,34 @@ def test_a_changed_source_is_compiled_in_a_folder_of_its_own(tmp_path, monkeypat
         assert function() == number
         folders.append(module.numba.config.CACHE_DIR)
     assert folders[0] != folders[1]
+
+
+COMPILE_AND_TELL = """
+import counted
+counted.total(counted.numbers)
+print(sum(counted.total.stats.cache_misses.values()))
+"""
+
+
+def test_of_two_processes_one_compiles_and_the_other_loads(tmp_path):
+    (tmp_path / "counted.py").write_text(
+        "import numpy as np\nfrom bricktrack_host.compiled import compiled\nnumbers = np.arange(5.0)\n\n\n"
+        "@compiled\ndef total(values):\n    return np.sort(values).sum()\n"
+    )
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", COMPILE_AND_TELL], cwd=tmp_path, env=environment, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    told = [process.communicate(timeout=120) for process in both]
+    assert [process.returncode for process in both] == [0, 0], told
+    assert sorted(int(out) for out, _ in told) == [0, 1]
+    # Whoever compiles says so; the other may have begun before anything was kept.
+    assert any("only once" in err for _, err in told)
