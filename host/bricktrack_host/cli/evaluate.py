@@ -1,5 +1,6 @@
 """``bricktrack evaluate``: the source paper's evaluation, simulated or of a recorded sweep."""
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +11,8 @@ from rich.table import Table
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.cli._console import out
+from bricktrack_host.cli._processing import StageBar, stage_bar
 from bricktrack_host.cli._progress import counting_bar
-from bricktrack_host.cli.process import stage_bar
 
 if TYPE_CHECKING:
     from bricktrack_host.evaluation.scores import SweepScore
@@ -47,7 +48,12 @@ def evaluate(
         float,
         typer.Option(min=0.001, max=5.0, help="Noise of simulated centroids and dots, each of u and v."),
     ] = 0.05,
-    seed: Annotated[int, typer.Option(min=0, help="Of the simulated lens and noise.")] = 1,
+    seed: Annotated[
+        list[int] | None,
+        typer.Option(
+            min=0, help="Of the simulated lens and noise; again for another lens. \\[default: 1 and 2]"
+        ),
+    ] = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for the page and its pictures.")
     ] = Path("evaluation"),
@@ -60,13 +66,13 @@ def evaluate(
     about each axis; then orientations to 45 degrees are identified from nothing. Rays are calibrated from
     noisy dots of a lens that the product does not know. With --images the brick is filmed instead, moving
     on by 1 mm or 1 degree from picture to picture, and solved with and without dome model and row times.
-    All figures are then simulated, and say so.
+    Each --seed is another lens; the table holds all of them. All figures are then simulated, and say so.
 
     For example:
 
         bricktrack evaluate
 
-        bricktrack evaluate --images --seed 3
+        bricktrack evaluate --images --seed 3 --seed 4
 
         bricktrack evaluate --noise-px 0.1 --seed 7 --json
 
@@ -77,66 +83,91 @@ def evaluate(
     if run is not None and positions is not None:
         _recorded(run, positions, align=align, output=output, as_json=as_json)
     elif images:
-        _filmed(seed, output=output, as_json=as_json)
+        _filmed(_seeds(seed), output=output, as_json=as_json)
     else:
-        _simulated(layout, noise_px=noise_px, seed=seed, output=output, as_json=as_json)
+        _simulated(layout, noise_px=noise_px, seeds=_seeds(seed), output=output, as_json=as_json)
 
 
-def _simulated(layout: Path | None, *, noise_px: float, seed: int, output: Path, as_json: bool) -> None:
+def _seeds(given: list[int] | None) -> list[int]:
+    return sorted(set(given or [1, 2]))
+
+
+def _lenses(seeds: list[int]) -> str:
+    return f"lens {seeds[0]}" if len(seeds) == 1 else "lenses " + ", ".join(map(str, seeds))
+
+
+def _simulated(
+    layout: Path | None, *, noise_px: float, seeds: list[int], output: Path, as_json: bool
+) -> None:
+    from functools import reduce
+    from operator import add
+
     from bricktrack_common.brick_model import load_brick_model
     from bricktrack_host.evaluation.paper_brick import paper_brick
     from bricktrack_host.evaluation.simulated_points import evaluate_points
 
     brick = paper_brick() if layout is None else load_brick_model(layout)
-    with counting_bar("sweeps and orientations", 1) as progress:
-        found = evaluate_points(brick, noise_px=noise_px, seed=seed, progress=progress)
-    identity = (
-        f"Identity from nothing, {found.n_orientations} simulated orientations within 45 degrees: "
-        f"{found.n_right} right, {found.n_wrong} wrong, {found.n_ambiguous} reported ambiguous."
-    )
+    found = []
+    for seed in seeds:
+        with counting_bar(f"sweeps and orientations, lens {seed}", 1) as progress:
+            found.append(evaluate_points(brick, noise_px=noise_px, seed=seed, progress=progress))
+    identity = reduce(add, (f.identity for f in found))
+    line = f"Identity from nothing, {identity.n} simulated orientations within 45 degrees: {identity}."
     extra = {
         "simulated": True,
         "noise_px": noise_px,
-        "seed": seed,
-        "identity": {
-            "n": found.n_orientations,
-            "right": found.n_right,
-            "wrong": found.n_wrong,
-            "ambiguous": found.n_ambiguous,
-        },
+        "seeds": seeds,
+        "identity": dataclasses.asdict(identity),
     }
-    title = f"Simulated sweeps, points with {noise_px:g} px of noise, lens {seed}"
-    _write_and_print(found.scores, title, extra, [identity], output=output, as_json=as_json, with_bound=True)
+    title = f"Simulated sweeps, points with {noise_px:g} px of noise, {_lenses(seeds)}"
+    _write_and_print(
+        {f"lens {seed}": f.scores for seed, f in zip(seeds, found, strict=True)},
+        title,
+        extra,
+        [line],
+        output=output,
+        as_json=as_json,
+        with_bound=True,
+    )
 
 
-def _filmed(seed: int, *, output: Path, as_json: bool) -> None:
+def _filmed(seeds: list[int], *, output: Path, as_json: bool) -> None:
     from bricktrack_host.evaluation import summary
     from bricktrack_host.evaluation.filmed_sweeps import evaluate_film
+    from bricktrack_host.evaluation.scores import joined
 
-    with stage_bar(f"evaluation, unit {seed}") as bar:
+    by_seed = {}
+    for seed in seeds:
+        with stage_bar(f"evaluation, unit {seed}") as bar:
 
-        def stage(name: str) -> Callable[[int, int], None]:
-            bar.stage(name, None)
-            return lambda done, of: show(name, done, of)
+            def stage(name: str, bar: StageBar = bar) -> Callable[[int, int], None]:
+                bar.stage(name, None)
 
-        def show(name: str, done: int, of: int) -> None:
-            if done <= 1:
-                bar.stage(name, of)
-            bar.advance_to(done)
+                def show(done: int, of: int) -> None:
+                    if done <= 1:
+                        bar.stage(name, of)
+                    bar.advance_to(done)
 
-        scores = evaluate_film(output / f"film_{seed}", seed=seed, stage=stage)
-    chosen, *others = scores
+                return show
+
+            by_seed[seed] = evaluate_film(output / f"film_{seed}", seed=seed, stage=stage)
+    chosen, *others = next(iter(by_seed.values()))
+    every = {
+        name: [joined(same) for same in zip(*(scores[name] for scores in by_seed.values()), strict=True)]
+        for name in (chosen, *others)
+    }
     lines = ["Filmed while moving on by 1 mm or 1 degree from picture to picture, 30 a second."]
     for name in others:
-        mm, deg = summary.pooled(scores[name])
+        mm, deg = summary.pooled(every[name])
         lines.append(f"{name}: {mm[0]:.4f}, {mm[1]:.4f}, {mm[2]:.4f} mm and {deg:.4f} deg over all sweeps.")
     extra = {
         "simulated": True,
-        "seed": seed,
-        "also": {name: summary.as_json(scores[name])["all"] for name in others},
+        "seeds": seeds,
+        "also": {name: summary.as_json(every[name])["all"] for name in others},
     }
-    title = f"Simulated sweeps on film, unit {seed}: {chosen}"
-    _write_and_print(scores[chosen], title, extra, lines, output=output, as_json=as_json, with_bound=False)
+    title = f"Simulated sweeps on film, {_lenses(seeds)}: {chosen}"
+    scores = {f"lens {seed}": scores[chosen] for seed, scores in by_seed.items()}
+    _write_and_print(scores, title, extra, lines, output=output, as_json=as_json, with_bound=False)
 
 
 def _recorded(run: Path, positions: Path, *, align: bool, output: Path, as_json: bool) -> None:
@@ -151,11 +182,13 @@ def _recorded(run: Path, positions: Path, *, align: bool, output: Path, as_json:
     lines = ["The stage's axes were turned onto the camera's; lengths were not scaled."] if align else []
     if result.manifest.simulated:
         title = f"Simulated: {title}"
-    _write_and_print([score], title, extra, lines, output=output, as_json=as_json, with_bound=False)
+    _write_and_print(
+        {positions.stem: [score]}, title, extra, lines, output=output, as_json=as_json, with_bound=False
+    )
 
 
 def _write_and_print(
-    scores: "list[SweepScore]",
+    by_camera: "dict[str, list[SweepScore]]",
     title: str,
     extra: dict[str, Any],
     lines: list[str],
@@ -167,19 +200,26 @@ def _write_and_print(
     """Write the page and its pictures, and print the table or the JSON."""
     from bricktrack_host.evaluation import summary
     from bricktrack_host.evaluation.figures import errors_figure, write_page
+    from bricktrack_host.evaluation.scores import joined
 
+    scores = [joined(same) for same in zip(*by_camera.values(), strict=True)]
     rows = summary.summary_rows(scores, with_bound=with_bound)
-    subtitle = "Root mean squares after zeroing at the first step: displacement and rotation since then."
-    caption = (
-        "Errors along each sweep; the band is twice the Cramér-Rao bound of the axis that it binds least."
+    subtitle = (
+        "Root mean squares after zeroing at the first step: displacement and rotation since then. NEES / 6: "
+        "squared errors, nothing zeroed, over what the covariances say; 1 on average over many cameras."
     )
+    band = " The band is twice the Cramér-Rao bound of the axis that it binds least." if with_bound else ""
+    figures = [
+        (errors_figure(own), f"{name[:1].upper()}{name[1:]}: errors along each sweep.{band}")
+        for name, own in by_camera.items()
+    ]
     written = write_page(
         output / "evaluation.html",
         title=title,
         subtitle=subtitle,
         tables=[{"title": "Errors", "columns": summary.COLUMNS, "rows": rows}],
         lines=lines,
-        figures=[(errors_figure(scores), caption if with_bound else "Errors along the sweep.")],
+        figures=figures,
     )
     if as_json:
         print(json.dumps({**extra, **summary.as_json(scores)}, indent=2))

@@ -12,7 +12,8 @@ from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.evaluation.filmed import Film, Progress, make_film, open_film
 from bricktrack_host.evaluation.scores import SweepScore, score_sweep
 from bricktrack_host.evaluation.sweeps import ROTATION_LIMIT_DEG, Sweep
-from bricktrack_host.tracking.optical_track import solve_poses
+from bricktrack_host.tracking.centroid_noise import with_measured_noise
+from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 
 _FRAME_S = 0.0333273
 _STEP_MM, _STEP_DEG = 1.0, 1.0
@@ -65,10 +66,15 @@ def evaluate_film(
         ("no row times", film.brick, False),
         ("neither", bare, False),
     ):
-        track = solve_poses(observations, film.rays, brick, rolling_shutter=rows)
+        first = start_poses(observations, film.rays, brick)
+        told = with_measured_noise(observations, first, film.rays, brick, rolling_shutter=rows)
+        track = solve_poses(told, film.rays, brick, rolling_shutter=rows, first=first)
         scores[name] = [
             score_sweep(
-                _truth(film, sweep, span, path), track.R_camera_brick[span], track.t_camera_brick_mm[span]
+                _truth(film, sweep, span, path),
+                track.R_camera_brick[span],
+                track.t_camera_brick_mm[span],
+                covariance=track.covariance[span],
             )
             for sweep, span in zip(names, spans, strict=True)
         ]

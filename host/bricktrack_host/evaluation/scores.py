@@ -1,5 +1,6 @@
 """What a sweep amounts to: errors after zeroing at its first step, beside the bound and the paper's."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,9 @@ class SweepScore:
         The same of the rotation since the first step.
     bound_mm, bound_deg : ndarray, shape (n, 3)
         Standard deviations that no unbiased method can fall below; NaN where the noise is not known.
+    nees : ndarray, shape (n,)
+        Squared error of each pose, nothing zeroed, over its covariance: 6 on average where that is honest.
+        NaN where there is none.
     """
 
     sweep: Sweep
@@ -35,6 +39,7 @@ class SweepScore:
     error_deg: FloatArray
     bound_mm: FloatArray
     bound_deg: FloatArray
+    nees: FloatArray
 
     @property
     def n_posed(self) -> int:
@@ -57,14 +62,17 @@ def score_sweep(
     R_camera_brick: FloatArray,
     t_camera_brick_mm: FloatArray,
     bound: FloatArray | None = None,
+    covariance: FloatArray | None = None,
 ) -> SweepScore:
     """Return the errors of poses, shapes (n, 3, 3) and (n, 3), NaN where there are none, along a sweep.
 
-    ``bound``, shape (n, 6, 6), is that of single poses; both ends of a displacement count.
+    ``bound``, shape (n, 6, 6), is that of single poses; both ends of a displacement count. ``covariance``,
+    shape (n, 6, 6), is what the poses say of themselves.
     """
     n = len(sweep)
     error_mm, error_deg = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
     bound_mm, bound_deg = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    nees = np.full(n, np.nan)
     posed = np.flatnonzero(all_finite(R_camera_brick, 2) & all_finite(t_camera_brick_mm))
     if posed.size:
         zero = posed[0]
@@ -78,7 +86,25 @@ def score_sweep(
             sd = np.sqrt(variance + np.where(np.arange(n) == zero, 0.0, 1.0)[:, None] * variance[zero])
             sd[zero] = 0.0
             bound_deg[posed], bound_mm[posed] = np.degrees(sd[posed, :3]), sd[posed, 3:]
-    return SweepScore(sweep, error_mm, error_deg, bound_mm, bound_deg)
+        if covariance is not None:
+            turn = rvec_from_matrix(np.swapaxes(R_camera_brick[posed], -1, -2) @ sweep.R_camera_brick[posed])
+            e = np.hstack([turn, sweep.t_camera_brick_mm[posed] - t_camera_brick_mm[posed]])
+            nees[posed] = np.sum(e * np.linalg.solve(covariance[posed], e[..., None])[..., 0], axis=1)
+    return SweepScore(sweep, error_mm, error_deg, bound_mm, bound_deg, nees)
+
+
+def joined(scores: Sequence[SweepScore]) -> SweepScore:
+    """Return the same sweep seen by several cameras as one: its steps one after the other."""
+    first = scores[0].sweep
+    sweep = Sweep(
+        first.name,
+        np.concatenate([s.sweep.step for s in scores]),
+        first.unit,
+        np.concatenate([s.sweep.R_camera_brick for s in scores]),
+        np.concatenate([s.sweep.t_camera_brick_mm for s in scores]),
+    )
+    names = ("error_mm", "error_deg", "bound_mm", "bound_deg", "nees")
+    return SweepScore(sweep, **{name: np.concatenate([getattr(s, name) for s in scores]) for name in names})
 
 
 def rms(values: FloatArray) -> FloatArray:

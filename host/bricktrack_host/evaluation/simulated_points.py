@@ -1,5 +1,6 @@
 """The paper's sweeps with points in place of pictures: true pixels, noise, and the product from there on."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -13,31 +14,70 @@ from bricktrack_host.evaluation.scores import SweepScore, score_sweep
 from bricktrack_host.evaluation.sweeps import Sweep, paper_sweeps, random_orientations
 from bricktrack_host.evaluation.true_camera import PLANE_A_MM, PLANE_B_MM, TrueCamera
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.correspondence import search_correspondence
+from bricktrack_host.tracking.correspondence import search_correspondences
 from bricktrack_host.tracking.optical_track import solve_poses
 from bricktrack_host.tracking.segment import Blobs
+from bricktrack_host.tracking.verification import Correspondence
 from bricktrack_host.tracks import LedObservations
 
 _MIN_FACING = 0.08  # an LED seen more from the side than this shows too little to be measured
 _SECOND_NS = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointsEvaluation:
-    """Scores of the sweeps, and how identities from nothing came out.
+@dataclass(frozen=True, slots=True)
+class IdentityCount:
+    """How identities from nothing came out.
 
     Attributes
     ----------
-    scores : list of SweepScore
-    n_orientations, n_right, n_wrong, n_ambiguous : int
-        Random orientations within 45 degrees; those with all LEDs right, with a wrong one, ambiguous.
+    n : int
+        Pictures.
+    right : int
+        All LEDs that are seen, and each the right one.
+    left_out : int
+        An LED not found, all others right.
+    wrong : int
+        An LED with another one's light.
+    ambiguous : int
+        Two assignments fit, said so.
+    refused : dict of str to int
+        No assignment, by the reason given.
     """
 
+    n: int
+    right: int
+    left_out: int
+    wrong: int
+    ambiguous: int
+    refused: dict[str, int]
+
+    def __add__(self, other: "IdentityCount") -> "IdentityCount":
+        return IdentityCount(
+            self.n + other.n,
+            self.right + other.right,
+            self.left_out + other.left_out,
+            self.wrong + other.wrong,
+            self.ambiguous + other.ambiguous,
+            dict(Counter(self.refused) + Counter(other.refused)),
+        )
+
+    def __str__(self) -> str:
+        parts = [
+            f"{self.right} right",
+            f"{self.left_out} right but for an LED left out",
+            f"{self.wrong} wrong",
+        ]
+        parts.append(f"{self.ambiguous} reported ambiguous")
+        parts += [f"{n} without an answer ({why})" for why, n in sorted(self.refused.items())]
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointsEvaluation:
+    """Scores of the sweeps, and how random orientations within 45 degrees were identified."""
+
     scores: list[SweepScore]
-    n_orientations: int
-    n_right: int
-    n_wrong: int
-    n_ambiguous: int
+    identity: IdentityCount
 
 
 def evaluate_points(
@@ -73,16 +113,28 @@ def evaluate_points(
         progress(len(scores), n_parts)
     turned = random_orientations(brick, n_orientations, plane_a_mm=PLANE_A_MM, plane_b_mm=PLANE_B_MM, rng=rng)
     uv = seen_points(turned, brick, camera, noise_px=noise_px, rng=rng)
-    right = wrong = ambiguous = 0
-    for i in range(n_orientations):
-        truth, blobs = _shuffled(uv[i], turned, i, brick, camera, noise_px, rng)
-        found = search_correspondence(blobs, rays, brick, collar_mm=None)
-        said = found.blob_of_led
-        right += int((said == truth).all())
-        wrong += int(((said >= 0) & (said != truth)).any())
-        ambiguous += int(found.is_ambiguous)
-        progress(len(scores) + i + 1, n_parts)
-    return PointsEvaluation(scores, n_orientations, right, wrong, ambiguous)
+    shuffled = [_shuffled(uv[i], turned, i, brick, camera, noise_px, rng) for i in range(n_orientations)]
+    found = search_correspondences([blobs for _, blobs in shuffled], rays, brick, collar_mm=None)
+    progress(n_parts, n_parts)
+    return PointsEvaluation(scores, _count([truth for truth, _ in shuffled], found))
+
+
+def _count(truths: list[IntArray], found: list[Correspondence]) -> IdentityCount:
+    right = left_out = wrong = ambiguous = 0
+    refused: Counter[str] = Counter()
+    for truth, answer in zip(truths, found, strict=True):
+        said = answer.blob_of_led
+        if answer.is_ambiguous:
+            ambiguous += 1
+        elif answer.n_found == 0:
+            refused[answer.reason] += 1
+        elif ((said >= 0) & (said != truth)).any():
+            wrong += 1
+        elif (said == truth).all():
+            right += 1
+        else:
+            left_out += 1
+    return IdentityCount(len(truths), right, left_out, wrong, ambiguous, dict(refused))
 
 
 def score_points(
@@ -106,7 +158,9 @@ def score_points(
         seen,
         noise_px=noise_px,
     )
-    return score_sweep(sweep, track.R_camera_brick, track.t_camera_brick_mm, bound)
+    return score_sweep(
+        sweep, track.R_camera_brick, track.t_camera_brick_mm, bound, covariance=track.covariance
+    )
 
 
 def points_of(brick: BrickModel) -> BrickModel:

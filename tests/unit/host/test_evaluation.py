@@ -11,9 +11,9 @@ from bricktrack_host.evaluation import filmed, filmed_sweeps
 from bricktrack_host.evaluation.bound import cramer_rao_covariance
 from bricktrack_host.evaluation.paper_brick import paper_brick
 from bricktrack_host.evaluation.recorded import read_positions, score_recording
-from bricktrack_host.evaluation.scores import score_sweep
-from bricktrack_host.evaluation.simulated_points import score_points
-from bricktrack_host.evaluation.summary import pooled
+from bricktrack_host.evaluation.scores import joined, score_sweep
+from bricktrack_host.evaluation.simulated_points import IdentityCount, score_points
+from bricktrack_host.evaluation.summary import nees_per_dof, pooled
 from bricktrack_host.evaluation.sweeps import Sweep, paper_sweeps
 from bricktrack_host.evaluation.true_camera import PLANE_A_MM, PLANE_B_MM, TrueCamera
 from bricktrack_host.tracking.optical_track import solve_poses
@@ -145,8 +145,8 @@ def test_the_command_prints_json_and_writes_its_page(tmp_path, monkeypatch):
     done = CliRunner().invoke(app, ["evaluate", "--json", "--seed", "3", "-o", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     said = json.loads(done.stdout)
-    assert said["simulated"] is True and said["identity"]["n"] == 2
-    assert len(said["sweeps"]) == 5
+    assert said["simulated"] is True and said["identity"]["n"] == 2 and said["seeds"] == [3]
+    assert len(said["sweeps"]) == 5 and 0.3 < said["all"]["nees_per_dof"] < 2.0
     page = (tmp_path / "out" / "evaluation.html").read_text(encoding="utf-8")
     assert "Simulated sweeps" in page and "0.2296" in page
     assert (tmp_path / "out" / "evaluation_1.png").stat().st_size > 20_000
@@ -198,3 +198,33 @@ def test_a_simulator_that_fails_is_an_error_that_says_why(tmp_path):
     (tmp_path / "motion.csv").write_text("nothing\n", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"ended with code 1: .*motion_csv"):
         filmed.make_film(tmp_path, seed=1, seconds=0.1, motion_csv=tmp_path / "motion.csv")
+
+
+def test_what_is_missing_among_identities_is_named():
+    counted = IdentityCount(100, 94, 3, 0, 1, {"no pose brings four LEDs onto blobs": 2})
+    assert str(counted + IdentityCount(10, 9, 0, 1, 0, {})) == (
+        "103 right, 3 right but for an LED left out, 1 wrong, 1 reported ambiguous, "
+        "2 without an answer (no pose brings four LEDs onto blobs)"
+    )
+
+
+def test_sweeps_of_two_lenses_are_one_table():
+    sweep = sweeps()[0]
+    covariance = np.tile(np.diag([1e-4] * 3 + [0.01] * 3), (len(sweep), 1, 1))
+    for_lens = [
+        score_sweep(
+            sweep,
+            sweep.R_camera_brick,
+            sweep.t_camera_brick_mm + np.outer(np.arange(len(sweep)) > 0, shift),
+            covariance=covariance,
+        )
+        for shift in ([0.1, 0.0, 0.0], [0.0, 0.0, 0.2])
+    ]
+    both = joined(for_lens)
+    assert len(both.sweep) == 2 * len(sweep)
+    n = len(sweep)
+    np.testing.assert_allclose(
+        both.rms_mm**2, [0.01 * (n - 1) / (2 * n), 0, 0.04 * (n - 1) / (2 * n)], atol=1e-12
+    )
+    # (0.1 mm)^2 over 0.01 mm^2 is one, (0.2 mm)^2 four; the first step of each is right.
+    assert nees_per_dof([both]) == pytest.approx((1 + 4) * (n - 1) / (2 * n) / 6)
