@@ -60,12 +60,13 @@ def require_dataset(root: Path) -> None:
 @contextmanager
 def locked(root: Path) -> Iterator[None]:
     """Hold the dataset alone, made if there is none, with what a kill left undone put right."""
-    if root.exists() and not (root / MARKER_NAME).is_file() and any(root.iterdir()):
+    partial = root / f".{MARKER_NAME}.partial"
+    if root.exists() and not (root / MARKER_NAME).is_file() and set(root.iterdir()) - {partial}:
         raise StorageError(
             f"{root} exists and holds no {MARKER_NAME}; it is left alone. Choose another folder"
         )
     with storage_errors(root, "The dataset cannot be written; make room, or choose another folder"):
-        (root / MOTION_FOLDER).mkdir(parents=True, exist_ok=True)
+        root.mkdir(parents=True, exist_ok=True)
         handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:
@@ -76,11 +77,11 @@ def locked(root: Path) -> Iterator[None]:
             ) from e
         with storage_errors(root, "The dataset cannot be written; make room"):
             if not (root / MARKER_NAME).is_file():
-                partial = root / f".{MARKER_NAME}.partial"
                 partial.unlink(missing_ok=True)
                 write_durably(partial, dump_json(_Marker()))
                 rename_durably(partial, root / MARKER_NAME)
             require_dataset(root)
+            (root / MOTION_FOLDER).mkdir(exist_ok=True)
             _finish(root)
             if (root / STAGED).exists():
                 shutil.rmtree(root / STAGED)
@@ -128,8 +129,8 @@ def _finish(root: Path) -> None:
             _keep(root, place)
         path.replace(target)
         _sync_up(target.parent, root)
-    shutil.rmtree(decided)
-    sync_folder(root)
+    rename_durably(decided, root / STAGED)  # done: what is left of it decides nothing any more
+    shutil.rmtree(root / STAGED)
 
 
 def _keep(root: Path, place: str) -> None:

@@ -204,7 +204,7 @@ def test_a_kill_at_any_step_leaves_the_dataset_as_before_or_as_after(
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(module, step, dies)
         add_units(root, sources, whole_tests=True)
-    # Adding begins with a call of _finish; its first rename decides.
+    # Adding begins with a call of _finish; its first rename decides, its second keeps what was there before.
     is_decided = step in ("_keep", "_sync_up") or (step, call) in (("_finish", 2), ("rename_durably", 2))
     found = rows_of(root).column("sample").to_numpy()
     np.testing.assert_array_equal(found, after if is_decided else before)
@@ -216,6 +216,26 @@ def test_a_kill_at_any_step_leaves_the_dataset_as_before_or_as_after(
     assert current(root) == current(campaign)
     assert len(list((root / "earlier").rglob("*.parquet"))) == 2
     assert {p.name for p in root.iterdir()} == {"dataset.json", "motion", "earlier"}
+
+
+@pytest.mark.parametrize("step", ["write_durably", "rename_durably", "rmtree"])
+def test_a_kill_while_a_dataset_is_made_or_tidied_up_does_not_lock_it(lab, tmp_path, monkeypatch, step):
+    root = tmp_path / "campaign"
+    sources = sources_of_test(lab / "shake-12")[:1]
+
+    def dies(path, *_):
+        if step == "write_durably":
+            path.write_bytes(b"half a mark")
+        elif step == "rmtree":
+            (path / "retire.json").unlink()
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(campaign_folder.shutil if step == "rmtree" else campaign_folder, step, dies)
+        add_units(root, sources, whole_tests=True)
+    done = add_units(root, sources, whole_tests=True)
+    assert done.unchanged if step == "rmtree" else done.added
+    assert {p.name for p in root.iterdir()} == {"dataset.json", "motion"}
 
 
 def test_a_process_that_is_killed_frees_the_dataset(lab, campaign, tmp_path):
