@@ -10,6 +10,9 @@
     test = analysis.load_test("tests/shake-12")
     test.components("brick-7")["C"].rotation_deg      # seen from the base
 
+    campaign = analysis.open_campaign("campaign")     # all tests, for queries
+    campaign.head(5)
+
 What the numbers mean is told by `MotionHistory`, and for tables by the metadata of each column.
 """
 
@@ -20,6 +23,7 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.dataset
 from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import FloatArray, IntArray
@@ -30,6 +34,7 @@ from bricktrack_host.assemblies.motion_history import (
     component_histories,
     run_history,
 )
+from bricktrack_host.datasets.campaign_dataset import open_dataset
 from bricktrack_host.quality import LedFlag, PoseFlag, describe
 from bricktrack_host.results.daq_table import join_samples, read_daq_csv
 from bricktrack_host.results.export import read_run_table
@@ -51,6 +56,7 @@ __all__ = [
     "join_daq",
     "load_run",
     "load_test",
+    "open_campaign",
     "spectrum",
 ]
 
@@ -201,6 +207,23 @@ def load_test(folder: str | Path) -> CombinedRuns:
         If the folder holds none, of this version.
     """
     return CombinedRuns(Path(folder), read_test(Path(folder)))
+
+
+def open_campaign(folder: str | Path, *, earlier: bool = False) -> "pa.dataset.Dataset":
+    """Return the dataset that ``bricktrack dataset add`` has filled, for queries.
+
+    Parameters
+    ----------
+    folder : str or Path
+    earlier : bool
+        The rows whose place others took, in place of those that hold now.
+
+    Raises
+    ------
+    RunFormatError
+        If the folder holds no dataset, or one of a newer version.
+    """
+    return open_dataset(Path(folder), earlier=earlier)
 
 
 def spectrum(motion: MotionHistory) -> Spectrum:
