@@ -17,7 +17,7 @@ from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import ConfigError, RunFormatError
 from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2
 from bricktrack_common.run_folder import Run, read_run
-from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
+from bricktrack_common.run_manifest import MANIFEST_NAME, RunManifest, read_manifest
 from bricktrack_host.fusion.moving_camera import CameraImu
 from bricktrack_host.results.daq_clock import EdgeFit, EdgeFitError, fit_edges
 from bricktrack_host.results.daq_table import read_daq_csv
@@ -26,6 +26,7 @@ from bricktrack_host.transfer.camera_config import AccelerationUnit, CameraTable
 from bricktrack_host.transfer.fleet_config import UnitConfig
 
 _Vector = tuple[float, float, float]
+_SAME_SHAKE_NS = 5_000_000_000  # clocks set by a time server; shakes are minutes apart
 _CLOCKS_WITHIN = 1e-3  # units of one shake see one wave, by crystals
 
 
@@ -142,14 +143,18 @@ def _of_table(
 def _run_beside(run: Path, unit: str) -> Path:
     """Return the other unit's run of the same shake: beside this one, with the same label."""
     manifest = read_manifest(run / MANIFEST_NAME)
-    label = manifest.label
-    found = [
-        path
+    label, date_ns = manifest.label, _date_ns(manifest)
+    dates_ns = {
+        path: _date_ns(other)
         for path in sorted(run.resolve().parent.glob(f"{unit}_*"))
         if (path / MANIFEST_NAME).is_file()
         and (other := read_manifest(path / MANIFEST_NAME)).unit == unit
         and other.label == label
-    ]
+    }
+    found = list(dates_ns)
+    if len(found) > 1 and date_ns is not None:  # the test was recorded more than once
+        found = [p for p, d in dates_ns.items() if d is not None and abs(d - date_ns) < _SAME_SHAKE_NS]
+        found = found or list(dates_ns)
     if len(found) != 1 or not label:
         raise ConfigError(
             f"{run}: the sensor that moves with its camera is unit '{unit}''s, and beside this run there "
@@ -157,6 +162,12 @@ def _run_beside(run: Path, unit: str) -> Path:
             "Name the one of the same shake with --camera-run"
         )
     return found[0]
+
+
+def _date_ns(manifest: RunManifest) -> int | None:
+    """Return the first edge by the unit's calendar clock, which may never have been set."""
+    triplet = manifest.clocks.trigger or manifest.clocks.arm
+    return None if triplet is None else triplet.realtime_ns
 
 
 def _seen_from(run: Path, other: Path) -> str:

@@ -1,9 +1,13 @@
 """What the fleet file says of a camera's own motion: taken if it goes together, else refused by its key."""
 
+import msgspec
 import pytest
+from run_folders import make_run
 
+from bricktrack_common.clocks import ClockTriplet
 from bricktrack_common.errors import ConfigError
-from bricktrack_host.stages.camera_sensor import CameraSensor
+from bricktrack_common.run_manifest import MANIFEST_NAME, ClocksSection, read_manifest, write_manifest
+from bricktrack_host.stages.camera_sensor import CameraSensor, choose_camera_sensor
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.transfer.fleet_config import load_fleet
 
@@ -71,3 +75,31 @@ def test_settings_are_stored_one_by_one():
     assert facts["camera_sensor_rotation"] == [0.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0]
     assert not any(isinstance(value, dict) for value in facts.values())
     assert not any(name.startswith("camera_sensor") for name in ProcessSettings().facts())
+
+
+def run_of(runs, run_id, unit, *, date_s=None, label="shake-12"):
+    folder = make_run(runs, run_id, {}, unit=unit)
+    clocks = ClocksSection()
+    if date_s is not None:
+        date_ns = 1_790_000_000_000_000_000 + int(date_s * 1e9)
+        clocks = ClocksSection(trigger=ClockTriplet(monotonic_ns=1, boottime_ns=1, realtime_ns=date_ns))
+    manifest = msgspec.structs.replace(read_manifest(folder / MANIFEST_NAME), label=label, clocks=clocks)
+    write_manifest(folder / MANIFEST_NAME, manifest)
+    return folder
+
+
+def test_the_other_units_run_of_the_same_shake_is_found_beside_this_one(tmp_path):
+    unit = load(tmp_path, FLEET).unit[0]
+    runs = tmp_path / "runs"
+    own = run_of(runs, "b7-2_aa_0002_shake-12", "b7-2", date_s=100.0)
+    run_of(runs, "b7-1_bb_0001_other", "b7-1", date_s=100.0, label="other")
+    with pytest.raises(ConfigError, match=r"there is none of that unit.*--camera-run"):
+        choose_camera_sensor(own, unit)
+    first = run_of(runs, "b7-1_bb_0002_shake-12", "b7-1")
+    assert choose_camera_sensor(own, unit).source == f"../{first.name}"
+    run_of(runs, "b7-1_bb_0003_shake-12", "b7-1")
+    with pytest.raises(ConfigError, match="are 2 runs of that unit labelled 'shake-12'"):
+        choose_camera_sensor(own, unit)
+    assert choose_camera_sensor(own, unit, camera_run=first).source == f"../{first.name}"
+    last = run_of(runs, "b7-1_bb_0004_shake-12", "b7-1", date_s=100.4)
+    assert choose_camera_sensor(own, unit).source == f"../{last.name}"
