@@ -105,31 +105,34 @@ def list_(
         return
     groups: dict[tuple[str, ...], list[UnitEntry]] = {}
     for entry in entries:
-        key = (entry.test, entry.assembly or "-", *((entry.unit, entry.run_id) if by_unit else ()))
+        key = (entry.test, entry.assembly or "-", *((entry.unit,) if by_unit else ()))
         groups.setdefault(key, []).append(entry)
     table = Table()
-    for header in ("test", "assembly", *(("unit", "run") if by_unit else ())):
-        table.add_column(header)
-    for header in (*(() if by_unit else ("units",)), "components", "rows", "MB", "problems", "earlier"):
-        table.add_column(header, justify="right")
-    table.add_column("samples")
+    for header in ("test", "assembly", *(("unit",) if by_unit else ()), "component", "samples"):
+        table.add_column(header, overflow="fold")
+    for header in (*(() if by_unit else ("units",)), "rows", "problems", "earlier"):
+        table.add_column(header, justify="right", no_wrap=True)
     for key, group in groups.items():
-        count = () if by_unit else (str(len(group)),)
         table.add_row(
             *key,
-            *count,
             ", ".join(c for e in group for c in e.components) or "-",
+            ", ".join(dict.fromkeys(e.sample_agreement for e in group)),
+            *(() if by_unit else (str(len(group)),)),
             str(sum(e.rows for e in group)),
-            f"{sum(e.size_bytes for e in group) / 1e6:.1f}",
             str(sum(len(e.problems) for e in group)),
             str(sum(e.earlier for e in group)),
-            ", ".join(dict.fromkeys(e.sample_agreement for e in group)),
         )
     out.print(table)
-    tests = len({entry.test for entry in entries})
+    counts = (
+        (len({entry.test for entry in entries}), "test"),
+        (len(entries), "unit"),
+        (sum(entry.rows for entry in entries), "row"),
+    )
     simulated = sum(entry.simulated for entry in entries)
     out.print(
-        f"{tests} tests, {len(entries)} units, {sum(e.rows for e in entries)} rows"
-        + (f"; {simulated} of the units' runs are simulated" if simulated else ""),
+        ", ".join(f"{n} {what}" if n == 1 else f"{n} {what}s" for n, what in counts)
+        + f", {sum(entry.size_bytes for entry in entries) / 1e6:.1f} MB"
+        + (f"; {simulated} of the runs simulated" if simulated else ""),
         markup=False,
+        soft_wrap=True,
     )

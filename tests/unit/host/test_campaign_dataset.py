@@ -388,7 +388,7 @@ def test_a_campaign_is_made_and_listed_by_commands(lab, tmp_path):
     assert "1 added: alone/-/b7-1" in done.output
     listed = invoke("dataset", "list", root)
     assert "2 tests, 3 units" in listed.output
-    assert "3 of the units' runs are simulated" in listed.output
+    assert "; 3 of the runs simulated" in listed.output
     entries = json.loads(invoke("dataset", "list", root, "--json").output)
     assert [e["components"] for e in entries] == [[], ["B"], ["C"]]
     assert entries[0]["assembly"] is None
