@@ -4,32 +4,31 @@ A lens that the solver does not know shows dots to calibrate from, and a brick i
 the bound of each pose: 1.00 is the best that any unbiased method can do. The others get the true lens. Development
 used seed 1; the figures printed are of another seed, and so of another lens.
 
-    python scripts/bench_pose.py [--frames 100000] [--searches 200] [--seed 2]
+    python scripts/bench_pose.py [--frames 100000] [--searches 2000] [--seed 2]
 """
 
 import argparse
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from identity_frames import HEADER, N_FALSE, fitted_brick, searched, tracked
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
-from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.evaluation.bound import cramer_rao_covariance
 from bricktrack_host.evaluation.paper_brick import paper_brick
 from bricktrack_host.evaluation.simulated_points import points_of
 from bricktrack_host.evaluation.true_camera import TrueCamera
-from bricktrack_host.tracking.correspondence import search_correspondence
 from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
 from bricktrack_host.tracking.optical_track import solve_poses
 from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import LedMotion, refine_poses
-from bricktrack_host.tracking.segment import Blobs
 from bricktrack_host.tracks import LedObservations
 
 NOISES_PX = (0.02, 0.05, 0.1)
@@ -41,7 +40,9 @@ OTHERS = 2000  # frames that the other solvers get: they take one at a time
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=100_000)
-    parser.add_argument("--searches", type=int, default=200)
+    parser.add_argument(
+        "--searches", type=int, default=2000, help="frames with two LEDs hidden, from nothing"
+    )
     parser.add_argument("--seed", type=int, default=2)
     args = parser.parse_args()
     brick = paper_brick()
@@ -226,67 +227,30 @@ def true_slopes(camera: TrueCamera, uv: FloatArray) -> FloatArray:
 
 
 def identities(n: int, seed: int, brick: BrickModel, camera: TrueCamera) -> None:
-    """Print how identities from nothing come out with LEDs hidden and five false lights."""
+    """Print how identities come out with LEDs hidden and five false lights: from nothing, and along runs."""
     rng = np.random.default_rng([seed, 7])
     rays = camera.calibrated(noise_px=0.05, rng=rng)
+    domes = fitted_brick(brick)
+    unfitted = replace(brick, led_profile=None)
+
+    def poses(m: int) -> tuple[FloatArray, FloatArray]:
+        scene = Scene.random(m, brick, camera, 0.05, rng)
+        return scene.R, scene.t
+
     print(
-        f"\nIdentity from nothing, five false lights, 0.05 px, {n} frames each; 'wrong' after the pose's outliers"
+        f"\nIdentities with {N_FALSE} false lights, 0.05 px; each frame from nothing, or runs of 450 frames"
     )
-    print("hidden  all right   some missing   ambiguous   wrong   ms a frame")
-    for n_hidden in (0, 1, 2):
-        scene = Scene.random(n, brick, camera, 0.05, rng)
-        counts = {"right": 0, "missing": 0, "ambiguous": 0, "wrong": 0}
-        start = time.process_time()
-        for i in range(n):
-            counts[search_one(scene, i, n_hidden, rays, rng)] += 1
-        ms = 1e3 * (time.process_time() - start) / n
-        shares = [counts[k] / n for k in ("right", "missing", "ambiguous")]
-        print(
-            f"{n_hidden:6d}  "
-            + "  ".join(f"{100 * s:9.2f} %" for s in shares)
-            + f"  {counts['wrong']:6d}  {ms:9.1f}"
-        )
-
-
-def search_one(scene: Scene, i: int, n_hidden: int, rays: RayModel, rng: np.random.Generator) -> str:
-    """Return what became of one frame: "right", "missing", "ambiguous" or "wrong"."""
-    brick, n_leds = scene.brick, scene.brick.n_leds
-    shown = np.sort(rng.permutation(n_leds)[n_hidden:])
-    false = rng.uniform([20, 20], [1900, 1060], (5, 2))
-    z = (brick.led_positions_mm @ scene.R[i].T + scene.t[i])[shown, 2]
-    area = (
-        np.pi * (brick.led_radii_mm[shown] * scene.camera.focal_px / z) ** 2 * rng.uniform(0.6, 1.0, len(z))
-    )
-    area = np.concatenate([area, np.exp(rng.uniform(np.log(900), np.log(6000), 5))])
-    uv = np.concatenate([scene.uv[i, shown], false])
-    order = rng.permutation(len(uv))
-    truth = np.full(n_leds, -1)
-    truth[shown] = np.argsort(order)[: len(shown)]
-    n = len(uv)
-    blobs = Blobs(
-        uv_px=uv[order],
-        cov_px2=np.tile(scene.noise_px**2 * np.eye(2), (n, 1, 1)),
-        area_px2=area[order],
-        eccentricity=np.zeros(n),
-        fill=np.ones(n),
-        flags=np.zeros(n, dtype=np.int64),
-    )
-    found = search_correspondence(blobs, rays, brick, collar_mm=None)
-    said = found.blob_of_led
-    if found.is_ambiguous:
-        return "ambiguous"
-    if (said >= 0).sum() > 4:  # as the product goes on: a pose, and its outliers are not used
-        seen = np.where((said >= 0)[:, None], blobs.uv_px[np.maximum(said, 0)], np.nan)
-        said = np.where(np.isfinite(used_in_pose(seen, rays, scene)), said, -1)
-    if ((said >= 0) & (said != truth)).any():
-        return "wrong"
-    return "right" if (said == truth).all() else "missing"
-
-
-def used_in_pose(uv: FloatArray, rays: RayModel, scene: Scene) -> FloatArray:
-    """Return the residual's u of the LEDs that the product's pose uses, NaN for others."""
-    track = solve_poses(observed(uv[None], scene), rays, scene.points, rolling_shutter=False)
-    return track.residual_px[0, :, 0]
+    print(HEADER)
+    for n_hidden, share in ((0, 0.1), (1, 0.3), (2, 1.0)):
+        found = searched(max(int(n * share), 1), n_hidden, poses, domes, camera, rays, rng)
+        print(f"from nothing, {n_hidden} hidden          {found}", flush=True)
+    few = max(n // 10, 1)
+    found = searched(few, 2, poses, domes, camera, rays, rng, mirrors=True)
+    print(f"  the false ones mirror images   {found}", flush=True)
+    found = searched(few, 2, poses, unfitted, camera, rays, rng, fitted=False)
+    print(f"  2 hidden, profile not fitted   {found}", flush=True)
+    for name, speed in (("at rest", 0.0), ("to 0.3 m/s", 1.0)):
+        print(f"run, 1 or 2 hidden, {name:10s}   {tracked(few, domes, camera, rays, rng, speed_share=speed)}")
 
 
 def observed(uv: FloatArray, scene: Scene, step_ns: int = 33_327_000) -> LedObservations:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.refine import OWN_SHARE
 
 _FLOOR_PX = 0.05  # calibration and rendering leave this at least
@@ -24,7 +25,6 @@ _AREA_SD = 0.2  # of the logarithm of an LED's area over the predicted one: glar
 _AREA_OTHER = 0.1  # share of LEDs whose area says nothing: partly covered, run together with another light
 _LOG_AREAS = np.log(81.0)  # of other lights: what segmentation lets pass is a third to three times the radius
 _SCATTERED = 4.0  # chi-square of so many times its freedom: two in a thousand at four, ever fewer
-_NO_POSE = 1e12  # squared residual, in variances, of a light without a pose that explains it
 _COMMON_AREA = 0.5  # limit of the logarithm of the factor that all areas share
 
 
@@ -85,7 +85,7 @@ def evidence_of(
     n_pixels : int
         Of the picture.
     min_leds : int
-        Assignments of fewer LEDs have minus infinity.
+        Assignments of fewer LEDs, or without a pose (residuals NaN), have minus infinity.
     """
     n_leds = kept.sum(axis=1)
     freedom = np.maximum(2.0 * n_leds - 6, 1.0)
@@ -96,7 +96,7 @@ def evidence_of(
         variance = variance + (OWN_SHARE * shift_sd_per_radius) ** 2 * radius2 * sine2
     variance = np.where(kept, np.where(is_whole, variance, variance + _CUT_SD_RADII**2 * radius2), 1.0)
     squares = (np.where(kept[..., None], residual_px, 0.0) ** 2).sum(axis=-1) / variance
-    squares = np.where(kept, np.nan_to_num(squares, nan=_NO_POSE), 0.0).sum(axis=1)
+    squares = np.where(kept, np.nan_to_num(squares), 0.0).sum(axis=1)
     mean_log = np.where(kept, np.log(variance), 0.0).sum(axis=1) / np.maximum(n_leds, 1)
     scale2 = np.maximum(squares, freedom)  # below that many the scale is one, the brick at rest
     # Integral over the logarithm of the scale s of s^-freedom exp(-squares / 2 s^2).
@@ -106,7 +106,8 @@ def evidence_of(
     places = 0.5 * freedom * (np.log(n_pixels / (2 * np.pi)) - mean_log)
     places = places + np.logaddexp(still, np.log(1 - at_rest) + moving)
     evidence = places + _of_areas(area_px2, predicted_px2, kept & is_whole)
-    return Evidence(np.where(n_leds >= min_leds, evidence, -np.inf), squares > _SCATTERED * freedom)
+    possible = (n_leds >= min_leds) & (all_finite(residual_px) | ~kept).all(axis=1)
+    return Evidence(np.where(possible, evidence, -np.inf), squares > _SCATTERED * freedom)
 
 
 def _of_areas(area_px2: FloatArray, predicted_px2: FloatArray, kept: BoolArray) -> FloatArray:

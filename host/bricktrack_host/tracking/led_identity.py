@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
@@ -34,6 +35,8 @@ from bricktrack_host.tracking.verification import (
 SegmentMethod = Literal["default", "paper"]
 
 _MAX_COAST_NS = 500_000_000  # after so long without LEDs the last pattern says nothing of a shaken brick
+
+_SUSPECT, _NEAR_FRAMES = 3.0, 9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,23 +193,40 @@ class _Run:
         starts = prsoi_starts(lights.uv_px, self._rays, self._brick, tolerance_mm=ROUGH_MM)
         none = ~all_finite(starts[0], 2)  # LEDs in one plane
         starts[0][none], starts[1][none] = R, t
-        verified = self._verify(lights, starts)
+        verified = self._verify(lights, starts, intruders=False)
         kept = verified.kept.sum(axis=1)
         whole = kept == all_finite(lights.uv_px).sum(axis=1)
         wrong, right = np.flatnonzero(~whole), np.flatnonzero(whole)
-        if not (wrong.size and right.size):
+        if wrong.size and right.size:
+            # PRSOI may have converged to a false pose: once more from the nearest frame that is believed.
+            nearest = right[np.abs(frames[right][None] - frames[wrong][:, None]).argmin(axis=1)]
+            start = (verified.poses.R_camera_brick[nearest], verified.poses.t_camera_brick_mm[nearest])
+            again = self._verify(lights.take(wrong), start, intruders=False)
+            more = again.kept.sum(axis=1) > kept[wrong]
+            verified = verified.replaced(wrong[more], again.take(np.flatnonzero(more)))
+        # A moving brick's residuals scatter, alike from frame to frame; where one frame's are far larger than
+        # its neighbours', a false light may be among its own.
+        rms = _rms_px(verified)
+        suspect = np.flatnonzero(rms > _SUSPECT * median_filter(rms, _NEAR_FRAMES, mode="nearest"))
+        if suspect.size == 0:
             return verified
-        # PRSOI may have converged to a false pose: once more from the nearest frame that is believed.
-        nearest = right[np.abs(frames[right][None] - frames[wrong][:, None]).argmin(axis=1)]
         poses = verified.poses
-        start = (poses.R_camera_brick[nearest], poses.t_camera_brick_mm[nearest])
-        again = self._verify(lights.take(wrong), start)
-        more = again.kept.sum(axis=1) > kept[wrong]
-        return verified.replaced(wrong[more], again.take(np.flatnonzero(more)))
+        again = self._verify(
+            lights.take(suspect), (poses.R_camera_brick[suspect], poses.t_camera_brick_mm[suspect])
+        )
+        return verified.replaced(suspect, again)
 
-    def _verify(self, lights: LedLights, starts: tuple[FloatArray, FloatArray]) -> Verified:
+    def _verify(
+        self, lights: LedLights, starts: tuple[FloatArray, FloatArray], *, intruders: bool = True
+    ) -> Verified:
         return verify(
-            lights, starts, self._rays, self._brick, collar_mm=self._collar_mm, gate_px=self._gate_px
+            lights,
+            starts,
+            self._rays,
+            self._brick,
+            collar_mm=self._collar_mm,
+            gate_px=self._gate_px,
+            intruders=intruders,
         )
 
     def _take(self, frames: IntArray, assigned: IntArray, verified: Verified, better: BoolArray) -> None:
@@ -222,7 +242,7 @@ class _Run:
         if at.size == 0:
             return
         start = (self.result.R_camera_brick[at], self.result.t_camera_brick_mm[at])
-        verified = self._verify(self._lights.of_leds(at, assigned), start)
+        verified = self._verify(self._lights.of_leds(at, assigned), start, intruders=False)
         more = verified.kept.sum(axis=1) > (self.result.blob_of_led[at] >= 0).sum(axis=1)
         self._take(at, assigned, verified, more)
 
@@ -249,3 +269,9 @@ class _Run:
                 out[row, k] = nearest
         more = (out != self.result.blob_of_led[frames]).any(axis=1)
         return frames[more], out[more]
+
+
+def _rms_px(verified: Verified) -> FloatArray:
+    """Return the root mean square residual of each assignment; 0 where it has no pose."""
+    squares = np.where(verified.kept, (verified.poses.residual_px**2).sum(axis=-1), 0.0).sum(axis=1)
+    return np.asarray(np.sqrt(squares / np.maximum(verified.kept.sum(axis=1), 1)))

@@ -200,6 +200,7 @@ def verify(
     collar_mm: float | None,
     gate_px: FloatArray | float,
     picture: IntArray | None = None,
+    intruders: bool = True,
 ) -> Verified:
     """Fit poses to assignments and keep the LEDs that each pose explains.
 
@@ -213,6 +214,8 @@ def verify(
         Largest residual that is believed.
     picture : ndarray of int64, shape (n,), optional
         Assignments of one picture compete: the hopeless are not looked at further. Default: each has its own.
+    intruders : bool
+        False: LEDs are left out only beyond the gate, however much the residuals scatter.
 
     Notes
     -----
@@ -263,7 +266,7 @@ def verify(
         uv[rows, np.where(bad[rows], length[rows], -1.0).argmax(axis=1)] = np.nan
         again, new = fit(rows, uv[rows], *start(rows))
         poses, evidence = poses.replaced(rows, again), evidence.replaced(rows, new)
-    for _ in range(_MAX_INTRUDERS):
+    for _ in range(_MAX_INTRUDERS if intruders else 0):
         best = np.full(int(picture.max(initial=0)) + 1, -np.inf)
         np.maximum.at(best, picture, evidence.log_ratio)
         hopeful = evidence.log_ratio > best[picture] - _HOPELESS
@@ -277,7 +280,9 @@ def verify(
         gain = new.log_ratio - evidence.log_ratio[rows[row]]
         order = np.lexsort((-gain, row))
         top = order[np.unique(row[order], return_index=True)[1]]  # the likeliest of each row
-        top = top[gain[top] > -_SURE]
+        # Four lights fit a pose by chance all too easily to cost a fifth the benefit of the doubt.
+        n_left = all_finite(tried[top]).sum(axis=1)
+        top = top[gain[top] > np.where(n_left > MIN_INLIERS, -_SURE, 0.0)]
         if top.size == 0:
             break
         at = rows[row[top]]

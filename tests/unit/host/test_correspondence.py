@@ -8,7 +8,6 @@ from pinhole import PinholeCamera
 from bricktrack_common.brick_model import LayoutFile, LedEntry, brick_model_from_file
 from bricktrack_host.tracking.correspondence import search_correspondence
 from bricktrack_host.tracking.paper_rules import identify_by_paper, is_paper_layout, paper_correspondence
-from bricktrack_host.tracking.pattern import assign_predicted
 from bricktrack_host.tracking.segment import Blobs
 
 CAMERA = PinholeCamera()
@@ -100,25 +99,6 @@ def test_the_likeliest_of_many_blobs_are_searched():
     odd = led < 0
     blobs = replace(blobs, area_px2=np.where(odd, 300.0, blobs.area_px2), fill=np.where(odd, 0.7, 1.0))
     check(search_correspondence(blobs, CAMERA, BRICK, collar_mm=None), led, at_least=7)
-
-
-def test_the_pattern_is_found_again_after_a_jump_over_several_leds():
-    R, t = random_poses(1, seed=41)
-    uv = CAMERA.project(leds_in_camera(R, t, BRICK)).uv_px[0]
-    jump = np.array([-180.0, 140.0])  # the column's LEDs are 130 to 240 px apart
-    blobs = np.vstack([uv + jump, [[1500.0, 90.0], [200.0, 500.0]]])
-    assigned = assign_predicted(blobs, uv, gate_px=50.0, shift_limit_px=340.0)
-    assert assigned.tolist() == list(range(7))
-    assert (assign_predicted(blobs[:0], uv, gate_px=50.0, shift_limit_px=340.0) == -1).all()
-    far = assign_predicted(uv + 900.0, uv, gate_px=50.0, shift_limit_px=100.0)
-    assert (far == -1).all()
-
-
-def test_a_hidden_led_stays_unassigned():
-    R, t = random_poses(1, seed=42)
-    uv = CAMERA.project(leds_in_camera(R, t, BRICK)).uv_px[0]
-    assigned = assign_predicted(np.delete(uv, 3, axis=0) + 20.0, uv, gate_px=50.0, shift_limit_px=340.0)
-    assert assigned.tolist() == [0, 1, 2, -1, 3, 4, 5]
 
 
 def test_the_papers_rules_identify_its_layout():
