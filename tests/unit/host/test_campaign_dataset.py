@@ -179,10 +179,29 @@ def test_a_test_that_is_older_than_its_runs_is_refused(lab, tmp_path):
         sources_of_test(tmp_path / "shake-12")
 
 
+@pytest.fixture(scope="module")
+def rows_made():
+    """Rows by what they were made of: the tests of kills need not make them again and again."""
+    return {}
+
+
+@pytest.fixture
+def quick_rows(rows_made, monkeypatch):
+    made = campaign_dataset.unit_rows
+
+    def unit_rows(source, source_id):
+        if source_id not in rows_made:
+            rows_made[source_id] = made(source, source_id)
+        return rows_made[source_id]
+
+    monkeypatch.setattr(campaign_dataset, "unit_rows", unit_rows)
+
+
 class Killed(BaseException):
     """Ends a command at once, as SIGKILL does: nothing catches it, and adding has nothing to clean up."""
 
 
+@pytest.mark.usefixtures("quick_rows")
 @pytest.mark.parametrize("call", [1, 2])
 @pytest.mark.parametrize("step", ["unit_rows", "rename_durably", "_finish", "_keep", "_sync_up"])
 def test_a_kill_at_any_step_leaves_the_dataset_as_before_or_as_after(
@@ -218,6 +237,7 @@ def test_a_kill_at_any_step_leaves_the_dataset_as_before_or_as_after(
     assert {p.name for p in root.iterdir()} == {"dataset.json", "motion", "earlier"}
 
 
+@pytest.mark.usefixtures("quick_rows")
 @pytest.mark.parametrize("step", ["write_durably", "rename_durably", "rmtree"])
 def test_a_kill_while_a_dataset_is_made_or_tidied_up_does_not_lock_it(lab, tmp_path, monkeypatch, step):
     root = tmp_path / "campaign"
