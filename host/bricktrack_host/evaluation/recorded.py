@@ -16,6 +16,9 @@ from bricktrack_host.tracks import OpticalTrack
 
 _POSITION, _ROTATION = ("x_mm", "y_mm", "z_mm"), ("rx_deg", "ry_deg", "rz_deg")
 
+_MIN_FRAMES_TO_TELL = 4
+_REST_MM, _REST_SIGMAS = 0.1, 6.0  # what a stage may settle; and what frames' noise makes of two halves
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferencePositions:
@@ -97,7 +100,7 @@ def score_recording(
     Raises
     ------
     ConfigError
-        If fewer than two rests have a pose.
+        If fewer than two rests have a pose, or the brick moves in one.
     """
     since_s = (track.t_ns - track.t_ns[0]) * 1e-9
     n = len(reference.start_s)
@@ -106,6 +109,7 @@ def score_recording(
     for k in range(n):
         rest = posed & (since_s >= reference.start_s[k]) & (since_s <= reference.end_s[k])
         if rest.any():
+            _require_rest(track.t_camera_brick_mm[rest], reference, k)
             t[k] = track.t_camera_brick_mm[rest].mean(axis=0)
             R[k] = nearest_rotation(track.R_camera_brick[rest].mean(axis=0)[None])[0]
     good = np.flatnonzero(all_finite(t))
@@ -129,3 +133,18 @@ def score_recording(
         name, angle if is_turned else along, "deg" if is_turned else "mm", true_R, t[zero] + true_mm
     )
     return score_sweep(sweep, R, t)
+
+
+def _require_rest(t_mm: FloatArray, reference: ReferencePositions, k: int) -> None:
+    """Refuse the ``k``-th rest if the brick's places in it, shape (n, 3), mm, move on from half to half."""
+    if len(t_mm) < _MIN_FRAMES_TO_TELL:
+        return
+    half = len(t_mm) // 2
+    moved_mm = float(np.linalg.norm(t_mm[-half:].mean(axis=0) - t_mm[:half].mean(axis=0)))
+    scatter_mm = float(np.linalg.norm(np.diff(t_mm, axis=0).std(axis=0))) / np.sqrt(2)
+    if moved_mm > max(_REST_MM, _REST_SIGMAS * scatter_mm * np.sqrt(2 / half)):
+        raise ConfigError(
+            f"rest {k + 1}, from {reference.start_s[k]:g} to {reference.end_s[k]:g} s: the brick moves on by "
+            f"{moved_mm:.2f} mm between its halves; expected one place. Take start_s and end_s from within "
+            "the rest, in seconds after the first frame"
+        )

@@ -137,6 +137,20 @@ def test_rests_outside_the_recording_are_refused(tmp_path):
         score_recording(track, read_positions(table), name="stage")
 
 
+def test_a_rest_in_which_the_brick_moves_is_refused(tmp_path):
+    sweep = sweeps()[0]
+    t = np.repeat(sweep.t_camera_brick_mm[:3], 20, axis=0)
+    t += np.random.default_rng(1).normal(0, 0.02, t.shape)
+    track = track_of(np.tile(np.eye(3), (60, 1, 1)), t)  # 0.1 s a frame: 2 s at each place
+    table = tmp_path / "stage.csv"
+    head = "start_s,end_s,x_mm,y_mm,z_mm\n0,1.9,0,0,0\n"
+    table.write_text(head + "2,3.9,0,0,1\n4,5.9,0,0,2\n", encoding="utf-8")
+    assert score_recording(track, read_positions(table), name="stage").rms_mm.max() < 0.03
+    table.write_text(head + "2.8,4.7,0,0,1\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"rest 2, from 2.8 to 4.7 s: the brick moves on by 0\.\d+ mm"):
+        score_recording(track, read_positions(table), name="stage")
+
+
 def test_the_command_prints_json_and_writes_its_page(tmp_path, monkeypatch):
     # Two orientations in place of a hundred: the rest is what the command is.
     from bricktrack_host.evaluation import simulated_points
