@@ -78,8 +78,9 @@ def _panel(ax: Any, score: SweepScore, error: FloatArray, bound: FloatArray, lab
         ax.fill_between(
             x, -2 * widest, 2 * widest, color="#eceff2", lw=0, label="twice the bound, widest axis"
         )
+    onwards = bool((np.diff(x) > 0).all())  # places in no order are points, not a line
     for k, (name, colour) in enumerate(zip("xyz", _COLOURS, strict=True)):
-        style = {"color": colour, "lw": 1.0, "marker": ".", "ms": 3}
+        style = {"color": colour, "lw": 1.0 if onwards else 0.0, "marker": ".", "ms": 3 if onwards else 7}
         ax.plot(x, error[:, k], **style, label=f"{name} (left: along, right: about)")
     ax.axhline(0, color="#8b929b", lw=0.6)
     ax.set_ylabel(label)
