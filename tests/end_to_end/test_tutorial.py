@@ -79,7 +79,8 @@ def test_a_test_day_with_a_simulated_unit_ends_in_a_report(tmp_path):
             os.kill(int((tmp_path / "unit.pid").read_text()), signal.SIGTERM)
         raise
     assert "1 of 1 units are ready" in outputs[5]
-    assert re.search(r"(\d+) of \1 frames gave a pose", outputs[7])
+    tracked = re.search(r"(\d+) of (\d+) frames gave a pose", outputs[7])
+    assert tracked is not None and int(tracked[1]) >= 0.95 * int(tracked[2]) > 0
     [report] = (tmp_path / "runs").glob("*/results/report.html")
     assert "Errors against the simulated truth" in report.read_text()
     assert (tmp_path / "stills" / "b7-1_leds.png").exists()
