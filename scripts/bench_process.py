@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -56,6 +57,33 @@ class Taken:
             f"{name:24s} {wall:7.2f} s wall {cpu:7.2f} s CPU   {1e3 * wall / n_frames:6.2f} and "
             f"{1e3 * cpu / n_frames:6.2f} ms a frame"
         )
+
+
+@dataclass
+class StageClock:
+    """Hears which stage of the processing begins, and notes what each took and how much memory there was."""
+
+    wall_s: dict[str, float] = field(default_factory=dict)
+    cpu_s: dict[str, float] = field(default_factory=dict)
+    peak_mb: dict[str, float] = field(default_factory=dict)
+    _now: tuple[str, float, float] | None = None
+
+    def stage(self, name: str, total: int | None) -> None:
+        """End the stage before and begin another."""
+        self.end()
+        self._now = name, time.perf_counter(), time.process_time()
+
+    def advance_to(self, done: int) -> None:
+        """Hear nothing."""
+
+    def end(self) -> None:
+        """Note what the stage took."""
+        if self._now is not None:
+            name, wall, cpu = self._now
+            self.wall_s[name] = time.perf_counter() - wall
+            self.cpu_s[name] = time.process_time() - cpu
+            self.peak_mb[name] = _peak_mb()
+        self._now = None
 
 
 def simulated_recording(duration_s: int = DURATION_S) -> tuple[Path, Path, Path]:
@@ -100,16 +128,19 @@ def main() -> None:
     print(f"{n} frames over {length_s:.1f} s{_mode(run)}; {os.cpu_count()} processors\n")
     before_mb = _peak_mb()
     video, decode, process = run.video, Taken(), Taken()
-    stages: list[dict[str, float]] = []
+    stages: list[StageClock] = []
     with tempfile.TemporaryDirectory() as scratch:
         for _ in range(options.repeat):
             decode.time(lambda: bare_decode(video, DECODER_THREADS))
-            processed = process.time(
-                lambda: process_run(
-                    folder, calibration=calibration, layout=layout, output=Path(scratch) / "results"
+            clock = StageClock()
+            process.time(
+                partial(
+                    process_run, folder, calibration=calibration, layout=layout,
+                    output=Path(scratch) / "results", progress=clock,
                 )
-            )
-            stages.append(processed.result.timings_s)
+            )  # fmt: skip
+            clock.end()
+            stages.append(clock)
     print(decode.line(f"bare decode, {DECODER_THREADS} threads", n))
     print(process.line("process", n))
     print("\nprocess / bare decode (median, and range over the repeats)")
@@ -120,10 +151,13 @@ def main() -> None:
         ratios = [p / d for p, d in zip(ours, bare, strict=True)]
         print(f"  {name:5s} {statistics.median(ratios):5.2f}   {min(ratios):.2f} to {max(ratios):.2f}")
     print(f"process / length of the recording, wall: {statistics.median(process.wall_s) / length_s:.2f}")
-    print("\nstage                    s wall   ms a frame")
-    for name in stages[0]:
-        seconds = statistics.median(s[name] for s in stages)
-        print(f"{name:22s} {seconds:8.2f} {1e3 * seconds / n:12.2f}")
+    print("\nstage                      s wall    s CPU   ms CPU a frame   peak memory so far, MB")
+    for name in stages[0].wall_s:
+        wall_s = statistics.median(s.wall_s[name] for s in stages)
+        cpu_s = statistics.median(s.cpu_s[name] for s in stages)
+        print(
+            f"{name:24s} {wall_s:8.2f} {cpu_s:8.2f} {1e3 * cpu_s / n:16.2f} {stages[0].peak_mb[name]:24.0f}"
+        )
     print(f"\npeak memory {_peak_mb():.0f} MB, of which {before_mb:.0f} MB are Python and its modules")
 
 
