@@ -27,7 +27,8 @@ from bricktrack_host.evaluation.simulated_points import points_of
 from bricktrack_host.evaluation.true_camera import TrueCamera
 from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
 from bricktrack_host.tracking.optical_track import solve_poses
-from bricktrack_host.tracking.prsoi import prsoi_starts
+from bricktrack_host.tracking.pattern import follow_pattern
+from bricktrack_host.tracking.prsoi import ROUGH_MM, prsoi_starts
 from bricktrack_host.tracking.refine import LedMotion, refine_poses
 from bricktrack_host.tracks import LedObservations
 
@@ -313,10 +314,18 @@ def timed(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
     rays = camera.calibrated(noise_px=0.05, rng=rng)
     scene = Scene.random(20_000, brick, camera, 0.05, rng)
     R, t = prsoi_starts(scene.uv, rays, scene.points)
+    n = len(scene.uv)
+    lights = (scene.uv[:1] + rng.normal(0, 10, (n, 1, 2)) + rng.normal(0, 1, (n, 7, 2))).reshape(-1, 2)
+    first, stamps = np.arange(n + 1) * 7, np.arange(n) * 33_327_000
+    nothing_known = np.zeros(n, dtype=bool)
     still = LedMotion(np.zeros((20_000, 7, 3)), np.zeros((20_000, 7, 3)), np.zeros((20_000, 7)))
     parts: dict[str, Callable[[], object]] = {
         "rays of the pixels": lambda: expand_at(hit_polynomials(rays), scene.uv),
         "rays and PRSOI": lambda: prsoi_starts(scene.uv, rays, scene.points),
+        "  as a start": lambda: prsoi_starts(scene.uv, rays, scene.points, tolerance_mm=ROUGH_MM),
+        "identity, followed": lambda: follow_pattern(
+            lights, first, stamps, nothing_known, 0, scene.uv[0], radius_px=35.0, max_coast_ns=10**9
+        ),
         "refinement, with rays": lambda: refine_poses(
             scene.uv, scene.cov, R, t, rays, scene.points, collar_mm=0.0, profile_is_exact=True
         ),

@@ -30,7 +30,7 @@ from bricktrack_host.tracking.verification import (
 )
 
 MAX_SEARCH_BLOBS = 12
-_RIVAL_EVIDENCE = 4.0  # log likelihood: fifty to one
+_RIVAL_EVIDENCE = 5.0  # log likelihood: 150 to one
 _SHOWN_AREA = 0.8  # of its disc: a dome shows between half and all of it
 
 
@@ -58,7 +58,7 @@ def search_correspondences(
     Returns
     -------
     list of Correspondence
-        Ambiguous where another assignment is less than fifty times less likely. Two poses of one assignment
+        Ambiguous where another assignment is less than 150 times less likely. Two poses of one assignment
         are no ambiguity of identity: the poses' stage tells them apart, or says so.
 
     Raises
