@@ -40,7 +40,8 @@ class PoseFlag(IntFlag):
     UNCOVERED = 32
     """A ray of this pose lies where the calibration extrapolates."""
     LED_PROFILE_UNKNOWN = 64
-    """LED shape never fitted; a bias of some 0.1 mm is possible, and is in the covariance."""
+    """LED shape fitted from this run alone, or not at all: then a bias of some 0.1 mm is possible. The
+    covariance says so."""
     DROPOUT = 128
     """Fused: no optical pose within one and a half frame periods."""
     IMPACT = 256
