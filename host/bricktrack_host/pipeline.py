@@ -5,6 +5,7 @@ stages, and refuses a run without poses.
 """
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -162,21 +163,25 @@ def process_run(
         timings_s=stages.seconds,
     )
     results_folder = output or folder / RESULTS_FOLDER
-    with stages("write report"):
-        comparison = _compare(result, folder, truth)
-        overlays, covered = pictures.overlays(observations, optical), calibration_picture(rays)
-        two = None
+    overlays, covered = pictures.overlays(observations, optical), calibration_picture(rays)
+
+    def report() -> tuple[str, TruthComparison | None]:
+        comparison, two = _compare(result, folder, truth), None
         if fusion is not None and fusion.pose_level is not None:
             two = TwoFusions(fusion.track, fusion.pose_level)
         extras = ReportExtras(overlays=overlays, calibration=covered, truth=comparison, fusions=two)
-        page = render_report(result, extras)
-    with stages("write tables"):
+        return render_report(result, extras), comparison
+
+    with stages("write report and tables"), ThreadPoolExecutor(1) as beside:
+        # Tables are packed without the interpreter's lock, and wait for the disk: the page is made meanwhile.
+        reported = beside.submit(report)
 
         def write_page(partial: Path) -> None:
             save_pictures(partial / PICTURES_NAME, overlays, covered)
-            (partial / REPORT_NAME).write_text(page, encoding="utf-8")
+            (partial / REPORT_NAME).write_text(reported.result()[0], encoding="utf-8")
 
         earlier = write_results(result, results_folder, also=write_page)
+    comparison = reported.result()[1]
     logger.info("%s: processed in %.1f s", folder.name, sum(stages.seconds.values()))
     return ProcessedRun(result, results_folder, results_folder / REPORT_NAME, comparison, earlier)
 
