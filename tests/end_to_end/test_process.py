@@ -268,3 +268,26 @@ def test_the_fleet_file_says_what_the_camera_moves_with(bench, tmp_path):
     )
     assert done.exit_code == 0, done.output
     assert "the position is not observable" in " ".join(done.output.split())
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("send", ["path", "bytes"])
+def test_a_cluster_gives_the_same_bytes_and_its_work_stands(processed, bench, tmp_path, send):
+    distributed = pytest.importorskip("distributed")
+    run, out = str(bench / "runs" / "sample_motion"), tmp_path / "out"
+    arguments = ["process", run, "-c", str(bench / "calibration.json"), "-l", str(LAYOUT), "-o", str(out)]
+    truth = ["--truth", str(SAMPLE / "truth")]
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0"
+    ) as cluster:
+        there = ["--scheduler", cluster.scheduler.address, "--send", send]
+        done = CliRunner().invoke(app, [*arguments, *truth, *there], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    for path in processed.folder.iterdir():
+        if path.suffix in (".parquet", ".csv") or path.name == "summary.json":
+            assert (out / path.name).read_bytes() == path.read_bytes(), path.name
+    done = CliRunner().invoke(app, [*arguments, *truth], catch_exceptions=False)
+    assert "processed already, of the same input" in done.output
+    done = CliRunner().invoke(app, [*arguments, *truth, "--no-imu"], catch_exceptions=False)
+    assert "processed already" not in done.output
+    assert f"earlier: {out}_1" in done.output.replace("\n", "")
