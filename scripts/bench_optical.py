@@ -22,8 +22,9 @@ from bricktrack_common.brick_model import BrickModel, ProfileEntry, load_brick_m
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_quaternion, rvec_from_matrix
 from bricktrack_host.calibration.calibration_file import load_calibration
+from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.led_fit import fit_collar
-from bricktrack_host.tracking.optical_track import observe_leds, solve_poses
+from bricktrack_host.tracking.optical_track import observe_leds, solve_poses, start_poses
 from bricktrack_host.tracking.segment import Picture, find_blobs, paper_filter
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
@@ -65,7 +66,9 @@ def main() -> int:
         for method in ("default", "paper"):
             for name, model in profiles.items():
                 for rows in (False, True) if r.name == "motion" else (False,):
-                    track = solve_poses(seen[r.name, method], rays, model, rolling_shutter=rows)
+                    first = start_poses(seen[r.name, method], rays, model)
+                    told = with_measured_noise(seen[r.name, method], first, rays, model, rolling_shutter=rows)
+                    track = solve_poses(told, rays, model, rolling_shutter=rows, first=first)
                     label = f"{r.name:9s}  {method:7s}  {name:7s}  {'yes' if rows else 'no ':3s}"
                     print(f"{label}   {r.judged(track)}")
                     if rows:

@@ -37,9 +37,9 @@ class ImuEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     rotation: tuple[_Vector, _Vector, _Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-DEFAULT_SHIFT_SD_PER_RADIUS = 0.0015
-"""Of a fitted LED profile: between LEDs that saturate, just do not, and are dim, the middle of the light
-moves along the axis by 0.001 to 0.0025 of radius times sine (simulated, limb 30 % darker)."""
+DEFAULT_SHIFT_SD_PER_RADIUS = 0.005
+"""Of an LED profile that does not say how good it is, as one from a drawing: limb darkening and the lens put
+the middle of the light up to 0.008 of radius times sine beside that of the shape (simulated)."""
 
 
 class ProfileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -122,6 +122,7 @@ def _layout_text(settings: SimSettings) -> str:
         "",
         "[led_profile]",
         f"collar_mm = {settings.collar_mm}",
+        "shift_sd_per_radius = 0.0015",
         'source = "known: the simulated LEDs are drawn with it"',
     ]
     for name, position, axis, radius in zip(

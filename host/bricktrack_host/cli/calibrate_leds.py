@@ -58,7 +58,7 @@ def leds(
     from bricktrack_host.cli._console import out
     from bricktrack_host.cli.process import stage_bar
     from bricktrack_host.pipeline import observe_run
-    from bricktrack_host.tracking.led_fit import fit_collar
+    from bricktrack_host.tracking.led_fit import LEAST_SHIFT_SD, fit_collar
     from bricktrack_host.tracking.led_positions import fit_positions
 
     brick = load_brick_model(layout)
@@ -80,7 +80,12 @@ def leds(
     else:
         fit = fit_collar(observations, rays.ray_model, brick)
         if positions:
-            start = replace(brick, led_profile=ProfileEntry(collar_mm=fit.collar_mm, source="being fitted"))
+            start = replace(
+                brick,
+                led_profile=ProfileEntry(
+                    collar_mm=fit.collar_mm, source="being fitted", shift_sd_per_radius=LEAST_SHIFT_SD
+                ),
+            )
             places = fit_positions(
                 observations, rays.ray_model, start, tolerance_mm=tolerance_mm, with_collar=True
             )

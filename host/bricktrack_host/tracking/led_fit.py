@@ -28,6 +28,9 @@ _N_FOLDS = 5
 _OUTLIER_SIGMAS = 4.0
 _BARELY_NEGATIVE_MM = 0.1
 _SIDE_ON_PX = 8.0  # of radius times sine; an LED seen from in front tells nothing of its shape
+LEAST_SHIFT_SD = 0.0015
+"""Between LEDs that saturate, just do not, and are dim, the middle of the light moves along the axis by 0.001
+to 0.0025 of radius times sine (simulated, limb 30 % darker): a fit in one light does not know the others."""
 OF_THE_SAME_RUN = "fitted in the run that it is used on"
 _SELF_FIT_SHIFT_SD = 0.005
 """Of a profile that the run itself gave: views of one shake are few, and nothing else checks them."""
@@ -279,7 +282,7 @@ class _Problem:
         of_led = np.where(side_on, beside, 0.0).sum(axis=0) / n
         own = float(np.sqrt(np.mean(of_led[side_on.any(axis=0)] ** 2))) / OWN_SHARE
         common = float(np.sqrt(np.mean(by_collar[side_on] ** 2)))
-        return float(min(max(np.hypot(own, common), DEFAULT_SHIFT_SD_PER_RADIUS), UNKNOWN_SHIFT_PER_RADIUS))
+        return float(min(max(np.hypot(own, common), LEAST_SHIFT_SD), UNKNOWN_SHIFT_PER_RADIUS))
 
     def solve(self, which: BoolArray, start_mm: float) -> float:
         """Return the collar that fits the given frames best."""
