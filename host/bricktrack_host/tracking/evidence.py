@@ -24,7 +24,7 @@ _LOG_SCALES = np.log(100.0)  # others have residuals up to so many times as larg
 _AREA_SD = 0.2  # of the logarithm of an LED's area over the predicted one: glare, limb darkening, the profile
 _AREA_OTHER = 0.1  # share of LEDs whose area says nothing: partly covered, run together with another light
 _LOG_AREAS = np.log(81.0)  # of other lights: what segmentation lets pass is a third to three times the radius
-_SCATTERED = 4.0  # chi-square of so many times its freedom: two in a thousand at four, ever fewer
+_SCATTERED = 2.0  # chi-square of so many times its freedom: one in ten at four, one in fifteen at six
 _COMMON_AREA = 0.5  # limit of the logarithm of the factor that all areas share
 
 

@@ -23,7 +23,8 @@ MIN_INLIERS = 4
 MIN_FACING = 0.05
 """Cosine between an LED's axis and the line of sight below which it is not believed to be seen."""
 _MAX_BAD, _MAX_INTRUDERS = 3, 2
-_SURE = 7.0  # log likelihood that an LED of an assignment that scatters must add to be believed: 1000 to one
+_SURE = 10.0
+"""Log likelihood that an LED must add to be believed where all the others fit as well as centroids can."""
 _HOPELESS = 25.0  # log likelihood below the best of the picture: an intruder left out does not make up for it
 _CUT_SD_GATES = 0.9
 """Trust in a cut light, over the gate: what is left has its centroid elsewhere, up to a radius."""
@@ -221,8 +222,8 @@ def verify(
     -----
     LEDs beyond the gate, or that the pose hides, are left out one at a time, the worst: a false light drags
     its neighbours' residuals with it. Where residuals scatter more than centroids do, a false light may be
-    among them: the assignment is tried without each of its LEDs, and the likeliest of these is taken unless
-    the LED that it lacks is a thousand times likelier to be one.
+    among them: the assignment is tried without each of its LEDs. The likeliest of these is taken where it is
+    likelier, or where all others then fit and the LED that it lacks does not speak for itself beyond doubt.
     """
     uv = lights.uv_px.copy()
     n = len(uv)
@@ -282,7 +283,8 @@ def verify(
         top = order[np.unique(row[order], return_index=True)[1]]  # the likeliest of each row
         # Four lights fit a pose by chance all too easily to cost a fifth the benefit of the doubt.
         n_left = all_finite(tried[top]).sum(axis=1)
-        top = top[gain[top] > np.where(n_left > MIN_INLIERS, -_SURE, 0.0)]
+        at_rest = ~new.is_scattered[top] & (n_left > MIN_INLIERS)
+        top = top[gain[top] > np.where(at_rest, -_SURE, 0.0)]
         if top.size == 0:
             break
         at = rows[row[top]]
