@@ -41,19 +41,25 @@ def frame_chi2(
 
     The smoothed state holds the frame itself. Taken out of it again: with A = H P H', r the residual and R
     the covariance that the filter gave the frame, the others alone leave R (R - A)^-1 r, and know the frame
-    to A + A (R - A)^-1 A.
+    to A + A (R - A)^-1 A. Both are taken along the axes in which R is one and A diagonal. Where A says more
+    than R, the state was linearised too far off to take the frame out: there it is judged as it is.
     """
     at = nodes.node_of_frame
     r, H = residuals(problem, estimate.state, at, b)
     H = H[..., estimate.of]
     A = H @ estimate.covariance[at, b] @ np.swapaxes(H, -1, -2)
     stated = problem.cov_seen[at, b]
-    given = stated * passed.inflation[at, b][:, None, None]
+    inflation = passed.inflation[at, b][:, None]
+    root = np.linalg.cholesky(stated * inflation[..., None])
+    white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, A), -1, -2))
+    share, V = np.linalg.eigh(0.5 * (white + np.swapaxes(white, -1, -2)))
     # A frame that alone fixes the state leaves no residual, and R - A near zero: judge it by a share of R.
-    rest = np.linalg.inv(1.02 * given - A)
-    out = used[:, None, None]
-    S = stated + np.where(out, A + A @ rest @ A, A)
-    r = np.where(used[:, None], (given @ rest @ r[..., None])[..., 0], r)
+    rest = np.where(used[:, None] & (share <= 1), 1.02 - share, 1.0)
+    known = np.where(used[:, None], np.where(share <= 1, share + share**2 / rest, 0.0), share)
+    axes = root @ V
+    along = np.linalg.solve(axes, r[..., None])[..., 0] / rest
+    r = (axes @ along[..., None])[..., 0]
+    S = axes * (1 / inflation + known)[:, None, :] @ np.swapaxes(axes, -1, -2)
 
     def chi2(part: slice) -> FloatArray:
         e = r[:, part]
