@@ -28,9 +28,9 @@ from bricktrack_host.results.result_store import (
 )
 from bricktrack_host.results.true_motion import read_true_motion
 from bricktrack_host.results.truth import TruthComparison, compare_with_truth
-from bricktrack_host.stages.clocks import align, choose_imu, fit_square_wave, rest_pose
+from bricktrack_host.stages.clocks import align, choose_imu, fit_square_wave, rest_pose, unsure_stamps
 from bricktrack_host.stages.details import alignment_details, calibration_details, calibration_picture
-from bricktrack_host.stages.motion import fuse_run, output_grid, retime
+from bricktrack_host.stages.motion import fuse_run, output_grid, retime, with_unsure_times
 from bricktrack_host.stages.pictures import FIND, RunPictures, observe_run, require_video
 from bricktrack_host.stages.progress import ProcessProgress, Silent, Stages
 from bricktrack_host.stages.settings import ProcessSettings
@@ -132,6 +132,7 @@ def process_run(
         edge_fit = fit_square_wave(run, problems)
         imu = choose_imu(run, brick, settings, problems)
         inertial = None if imu is None else align(optical, imu, run, brick, edge_fit, settings, problems)
+        time_sd_ns = unsure_stamps(observations.sensor_timestamp_ns, optical, inertial, problems)
         rest = rest_pose(optical, inertial, problems)
     with stages("fuse"):
         if settings.rolling_shutter:
@@ -140,6 +141,7 @@ def process_run(
         grid = output_grid(optical, inertial, edge_fit)
         seen = (observations, rays.ray_model) if settings.rolling_shutter else None
         fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
+        optical, fused = with_unsure_times(optical, fused, time_sd_ns)
     result = RunResult(
         manifest=run.manifest,
         led_names=brick.led_names,

@@ -55,6 +55,9 @@ class PoseFlag(IntFlag):
     """Fused: before the first or after the last optical pose."""
     OPTICAL_ONLY = 4096
     """Fused: smoothed from the optical poses alone; the position owes nothing to inertial data."""
+    UNSURE_TIME = 8192
+    """The stamps here disagree with the camera's steady rate or with the inertial samples, so the instant of
+    the pose is unsure. The covariance says so."""
 
 
 def describe(flags: int) -> str:

@@ -164,6 +164,48 @@ def common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> FloatA
     return np.asarray(share_at[:, None] * np.median(cov_seen, axis=0) * share_at)
 
 
+def unsure_times(
+    t_ns: IntArray, frames_ns: IntArray, time_sd_ns: FloatArray, motion: FusedTrack
+) -> tuple[FloatArray, IntArray]:
+    """Return what instants that are unsure add to the covariance of poses, and their flags.
+
+    Parameters
+    ----------
+    t_ns : ndarray of int64, shape (n,), camera time
+        Of the poses.
+    frames_ns, time_sd_ns : ndarray, shape (n_frames,), ns
+        How unsure the frames' instants are; between them linear.
+    motion : FusedTrack
+        What tells the velocities.
+
+    Returns
+    -------
+    covariance : ndarray, shape (n, 6, 6), of ``[dtheta rad, dt mm]``
+        The motion in one sd, earlier and later. NaN where no velocity is known at all.
+    flags : ndarray of int64, shape (n,)
+    """
+    sd_s = np.interp(t_ns, frames_ns, time_sd_ns) * 1e-9
+    flags = np.where(sd_s > 0, int(PoseFlag.UNSURE_TIME), 0)
+    twist = np.concatenate([motion.omega_brick_radps, motion.v_camera_mmps], axis=1)
+    known = np.isfinite(twist).all(axis=1)
+    covariance = np.zeros((len(t_ns), 6, 6))
+    if not known.any():
+        covariance[sd_s > 0] = np.nan
+        return covariance, flags
+    at_s = seconds_since(motion.t_ns[known], int(frames_ns[0]))
+    t_s = seconds_since(t_ns, int(frames_ns[0]))
+
+    def twist_at(instants_s: FloatArray) -> FloatArray:
+        return np.stack([np.interp(instants_s, at_s, column) for column in twist[known].T], axis=1)
+
+    now = twist_at(t_s)
+    for side in (-1.0, 1.0):
+        # The mean of the velocities at both ends: where the motion turns round, it still went somewhere.
+        moved = 0.5 * (now + twist_at(t_s + side * sd_s)) * sd_s[:, None]
+        covariance += 0.5 * moved[:, :, None] * moved[:, None, :]
+    return covariance, flags
+
+
 def _add_bridge(
     P: FloatArray, problem: Problem, k: IntArray, b: int, dt: FloatArray, nodes: Nodes, *, is_smoothed: bool
 ) -> None:

@@ -162,8 +162,8 @@ def _flag_problems(result: RunResult, figures: KeyFigures) -> list[str]:
         )
     if count(PoseFlag.LED_PROFILE_UNKNOWN):
         found.append(
-            "the shape of these LEDs was never fitted: a bias of some 0.1 mm is possible. Run 'bricktrack "
-            "calibrate leds'"
+            "the layout file holds no profile of these LEDs: their shape was fitted to this run alone, where "
+            "it told one, and a bias of some 0.1 mm is possible. Run 'bricktrack calibrate leds'"
         )
     if n := count(PoseFlag.UNCOVERED):
         found.append(f"{n} poses use rays where the calibration had no dots and extrapolates")

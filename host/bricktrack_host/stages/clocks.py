@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.errors import ConfigError, ShapeError, TrackingError
 from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2, ImuDescription, ImuSamples
 from bricktrack_common.run_folder import Run
+from bricktrack_host.fusion.frame_stamps import check_stamps
 from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE, CameraAlignment, CameraImu, align_both
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.results.daq_clock import EdgeFit, EdgeFitError, fit_edges
@@ -162,6 +165,22 @@ def align(
             f"{inertial.camera_alignment.camera.reason}"
         )
     return inertial
+
+
+def unsure_stamps(
+    stamps_ns: IntArray, optical: OpticalTrack, inertial: Inertial | None, problems: list[str]
+) -> FloatArray:
+    """Return how unsure the instant of each frame is, ns, where its stamps cannot all be right, and say why.
+
+    Shape (n_frames,); zero where nothing speaks against them. ``stamps_ns`` are the sensor's.
+    """
+    if inertial is None or inertial.is_hint or inertial.camera is not None:
+        # What a moving camera sees turn is not what the sensor on the brick feels: the rate alone counts.
+        check = check_stamps(stamps_ns, optical, None, None)
+    else:
+        check = check_stamps(stamps_ns, optical, inertial.imu, inertial.alignment)
+    problems.extend(check.problems)
+    return np.asarray(check.sd_ns, dtype=np.float64)
 
 
 def rest_pose(optical: OpticalTrack, inertial: Inertial | None, problems: list[str]) -> RestPose | None:

@@ -1,6 +1,6 @@
 """The stage of the motion: the instants wanted, frames and inertial samples together, and what fell out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_host.fusion.estimate import FusionResult, fuse
+from bricktrack_host.fusion.fused_output import unsure_times
 from bricktrack_host.fusion.inertial_hint import InertialHint
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.tight import fuse_tight
@@ -155,6 +156,26 @@ def _fuse_tight(
             f"{100 * tight.check.share_apart:.0f} % of the instants by more than their uncertainty allows"
         )
     return tight.fused
+
+
+def with_unsure_times(
+    optical: OpticalTrack, fused: dict[FusedKind, FusedTrack], time_sd_ns: FloatArray
+) -> tuple[OpticalTrack, dict[FusedKind, FusedTrack]]:
+    """Return the poses with the motion in the time that their stamps are unsure by, in covariance and flags.
+
+    ``time_sd_ns``, shape (n_frames,): of the instants of the optical poses; between them it is linear.
+    """
+    if not time_sd_ns.any():
+        return optical, fused
+    velocity = max(fused.values(), key=lambda track: len(track.t_ns))
+    frames_ns = optical.t_ns
+    spread, flags = unsure_times(optical.t_ns, frames_ns, time_sd_ns, velocity)
+    optical = replace(optical, covariance=optical.covariance + spread, flags=optical.flags | flags)
+    widened: dict[FusedKind, FusedTrack] = {}
+    for kind, track in fused.items():
+        spread, flags = unsure_times(track.t_ns, frames_ns, time_sd_ns, velocity)
+        widened[kind] = replace(track, covariance=track.covariance + spread, flags=track.flags | flags)
+    return optical, widened
 
 
 def _rows(track: FusedTrack, rows: slice) -> FusedTrack:

@@ -193,7 +193,7 @@ def test_flags_of_the_whole_run_become_words(result):
     _, problems = verdict(blurred, key_figures(blurred))
     said = " ".join(problems)
     assert f"LEDs lie {20 * key_figures(result).residual_rms_px:.2f} px" in said
-    assert "never fitted" in said
+    assert "no profile of these LEDs" in said and "never fitted" not in said
     assert "7 poses use rays" in said
 
 

@@ -1,0 +1,363 @@
+"""Whether the frames' stamps can be right, by the camera's steady rate and by the inertial samples.
+
+The sensor of a free-running camera keeps its period to parts in a million, and the kernel stamps it to some
+tens of microseconds. Stamps that step or scatter by more were made elsewhere, or edited, or the camera
+paused: where the brick turned on both sides, the inertial samples tell which.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.rotation_fit import Fit, RotationFit
+from bricktrack_host.fusion.sample_clock import RATE_SD
+from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
+from bricktrack_host.tracks import ImuTrack, OpticalTrack
+
+MIN_FRAMES = 12
+JITTER_NS = 100e3  # at 0.25 m/s 0.025 mm, what a good pose is unsure of anyway
+_STEP_NS = 2 * JITTER_NS
+_STEP_SIGMA = 6.0
+_BESIDE = 5  # intervals on either side that say what is usual there
+_MANY_STEPS = 0.05  # of the intervals: then the camera has no steady rate
+_WANDER = 2.5  # residual from a straight line in units of the local scatter; 1 where the rate is steady
+_WINDOW_S = 3.0  # of motion on either side of a step
+_CLOCK_RATE_SD = 1e-4  # of two crystals against each other
+_FLOOR_S = 0.3e-3  # to which two fits of one offset agree, with all that their sd leave out
+_SIGMA = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class StampStep:
+    """A place where the interval between two stamps is not a whole number of periods, and stays so.
+
+    Attributes
+    ----------
+    frame : int
+        The first frame after it, from 0.
+    interval_ns : float
+        Between the stamps of that frame and the one before.
+    size_ns : float
+        What the interval has more than the nearest whole number of periods.
+    """
+
+    frame: int
+    interval_ns: float
+    size_ns: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StampRegularity:
+    """How regular the stamps of a run are.
+
+    Attributes
+    ----------
+    is_steady : bool
+        Whether there is a steady rate to compare with; without it nothing below is found.
+    period_ns : float
+        Steady: the fitted period; else the median interval. NaN for fewer than two frames.
+    shortest_ns, longest_ns : float
+        Interval, dropped frames taken out; NaN as above.
+    jitter_ns : float
+        Standard deviation of single stamps about the steady rate, steps and strays left out.
+    steps : tuple of StampStep
+    stray_ns : ndarray, shape (n_frames,)
+        How far single stamps lie off where their neighbours lie on; zero for all others.
+    """
+
+    is_steady: bool
+    period_ns: float
+    shortest_ns: float
+    longest_ns: float
+    jitter_ns: float
+    steps: tuple[StampStep, ...]
+    stray_ns: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetChange:
+    """By how much the offset of IMU and camera differs between two stretches of a run, s, by rotations."""
+
+    change_s: float
+    sd_s: float
+
+
+def stamp_regularity(stamps_ns: IntArray) -> StampRegularity:
+    """Return how regular the frames' stamps are. Dropped frames, whole periods, do not count against them.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int64, shape (n_frames,), ns, rising
+    """
+    n = len(stamps_ns)
+    intervals = np.diff(stamps_ns).astype(np.float64)
+    none = np.zeros(n)
+    if n < MIN_FRAMES:
+        shortest, median, longest = (
+            (intervals.min(), np.median(intervals), intervals.max()) if n > 1 else (np.nan,) * 3
+        )
+        return StampRegularity(False, float(median), float(shortest), float(longest), 0.0, (), none)
+    period = float(np.median(intervals))
+    number = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(intervals / period), 1.0))])
+    # Over several periods: stamps rounded to milliseconds have no typical interval of their own.
+    far = min(10, n // 8) or 1
+    since = (stamps_ns - stamps_ns[0]).astype(np.float64)
+    period = float(np.median((since[far:] - since[:-far]) / (number[far:] - number[:-far])))
+    excess = intervals - np.diff(number) * period
+    steps, stray = _steps_and_strays(excess)
+    sizes = dict(steps)
+    steady = since.copy()
+    for k, size in steps:
+        steady[k + 1 :] -= size
+    keep = stray == 0
+    line = np.polyfit(number[keep], steady[keep], 1)
+    residual = (steady - np.polyval(line, number))[keep]
+    inside = keep[:-2] & keep[1:-1] & keep[2:]
+    bend = (np.diff(steady, 2) - np.diff(number, 2) * line[0])[inside]
+    local = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6) if len(bend) else 0.0
+    wander = float(np.sqrt(np.mean(residual**2)))
+    one = intervals / np.diff(number)
+    is_steady = wander <= _WANDER * max(local, JITTER_NS) and len(steps) <= max(2, _MANY_STEPS * n)
+    return StampRegularity(
+        is_steady=bool(is_steady),
+        period_ns=float(line[0]) if is_steady else float(np.median(intervals)),
+        shortest_ns=float(one.min()),
+        longest_ns=float(one.max()),
+        jitter_ns=wander if is_steady else 0.0,
+        steps=tuple(StampStep(k + 1, float(intervals[k]), size) for k, size in sizes.items())
+        if is_steady
+        else (),
+        stray_ns=stray if is_steady else none,
+    )
+
+
+def _steps_and_strays(excess_ns: FloatArray) -> tuple[list[tuple[int, float]], FloatArray]:
+    """Return the intervals that stand out of those beside them for good, with sizes, and stamps off alone."""
+    n = len(excess_ns)
+    limit = max(_STEP_SIGMA * 1.4826 * float(np.median(np.abs(excess_ns))), _STEP_NS)
+    usual = np.array(
+        [
+            [
+                np.median(excess_ns[max(k - _BESIDE, 0) : k]) if k else excess_ns[0],
+                np.median(excess_ns[k + 1 : k + 1 + _BESIDE]) if k < n - 1 else excess_ns[-1],
+            ]
+            for k in range(n)
+        ]
+    )
+    # Where the rate itself changes, an interval is like those after it: that is no step.
+    above = excess_ns[:, None] - usual
+    out = (np.abs(above) > limit).all(axis=1) & (above[:, 0] * above[:, 1] > 0)
+    # At either end there is nothing beyond: the one side decides.
+    out[0], out[-1] = abs(above[0, 1]) > limit, abs(above[-1, 0]) > limit
+    jump = np.where(out, above[np.arange(n), np.abs(above).argmin(axis=1)], 0.0)
+    jump[0], jump[-1] = above[0, 1] * out[0], above[-1, 0] * out[-1]
+    steps: list[tuple[int, float]] = []
+    stray = np.zeros(n + 1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], out.astype(np.int8), [0]])))
+    for first, end in edges.reshape(-1, 2).tolist():
+        total = float(jump[first:end].sum())
+        if end - first == 1 and first in (0, n - 1):
+            # The first or the last stamp alone: a step there would be no more than that.
+            stray[0 if first == 0 else n] = -total if first == 0 else total
+        elif abs(total) > limit:
+            steps.append((end - 1, total))
+            stray[first + 1 : end] = np.cumsum(jump[first : end - 1])
+        else:
+            stray[first + 1 : end] = np.cumsum(jump[first : end - 1])
+    return steps, stray
+
+
+def offset_change(
+    optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, *, split_ns: int, from_ns: int, to_ns: int
+) -> OffsetChange | None:
+    """Return by how much the offset of IMU and camera changes at an instant, by the rotations on both sides.
+
+    Parameters
+    ----------
+    optical : OpticalTrack
+    imu : ImuTrack
+        In brick axes.
+    alignment : TimeAlignment
+        Of the whole run.
+    split_ns, from_ns, to_ns : int, ns, camera time
+        The instant, and what to look at around it.
+
+    Returns
+    -------
+    change : OffsetChange or None
+        Later less earlier, s; None where the run has no offset by its motion, or one side turns too little.
+    """
+    if alignment.source != "data":
+        return None
+    clock = alignment.sample_clock
+    signal = ImuSignal.from_track(
+        imu if clock is None else clock.restamp(imu), gyro_filter_s=alignment.gyro_filter_s
+    )
+    seen = has_pose(optical) & (optical.t_ns >= from_ns) & (optical.t_ns <= to_ns)
+    is_after = optical.t_ns >= split_ns
+    earlier = _offset(optical, alignment, signal, seen & ~is_after)
+    later = _offset(optical, alignment, signal, seen & is_after)
+    if earlier is None or later is None:
+        return None
+    change_s, variance_s2 = 0.0, _FLOOR_S**2
+    split_s = float(seconds_since(alignment.imu_time_ns(np.array([split_ns])), signal.epoch_ns)[0])
+    for sign, (fit, mid_s) in ((-1.0, earlier), (1.0, later)):
+        # Each side's own rate carries it to the split: the whole run's has taken up part of any step.
+        at_split = np.array([1.0, split_s - mid_s])
+        change_s += sign * float(at_split @ [fit.offset_s, fit.skew])
+        variance_s2 += float(at_split @ fit.covariance[:2, :2] @ at_split)
+    return OffsetChange(change_s, float(np.sqrt(variance_s2)))
+
+
+def _offset(
+    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray
+) -> tuple[Fit, float] | None:
+    """Return what some frames say of the offset beyond the alignment's, and the middle of their times."""
+    if not frames.any():
+        return None
+    # In IMU time by the alignment: what is left to find is zero where it holds.
+    t_s = seconds_since(alignment.imu_time_ns(optical.t_ns[frames]), signal.epoch_ns)
+    sd_rad = np.sqrt(np.trace(optical.covariance[frames][:, :3, :3], axis1=1, axis2=2) / 3)
+    solver = RotationFit(
+        t_s,
+        optical.R_camera_brick[frames],
+        np.maximum(sd_rad, MIN_ROTATION_SD_RAD),
+        signal,
+        skew_prior_sd=_CLOCK_RATE_SD if alignment.sample_clock is None else RATE_SD,
+    )
+    fit = solver.solve(0.0)
+    return None if fit is None else (fit, float(0.5 * (t_s[0] + t_s[-1])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StampCheck:
+    """What can be said against the frames' stamps.
+
+    Attributes
+    ----------
+    regularity : StampRegularity
+    sd_ns : ndarray, shape (n_frames,), ns
+        How unsure the instant of each frame is for it; zero where nothing speaks against the stamps.
+    problems : tuple of str
+        In words.
+    """
+
+    regularity: StampRegularity
+    sd_ns: FloatArray
+    problems: tuple[str, ...]
+
+
+def check_stamps(
+    stamps_ns: IntArray, optical: OpticalTrack, imu: ImuTrack | None, alignment: TimeAlignment | None
+) -> StampCheck:
+    """Return what the camera's steady rate and the inertial samples say against the frames' stamps.
+
+    Which side of a step is wrong nothing tells, so all frames of the run are unsure by it; unless the motion
+    says that the camera paused and the stamps are right.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int64, shape (n_frames,), ns, rising
+        Of the frames of ``optical``.
+    optical : OpticalTrack
+    imu, alignment : ImuTrack and TimeAlignment, or None
+        Without them the rate alone is looked at.
+    """
+    regularity = stamp_regularity(stamps_ns)
+    problems: list[str] = []
+    sd_ns = np.abs(regularity.stray_ns)
+    period_ms = regularity.period_ns / 1e6
+    if not regularity.is_steady and len(stamps_ns) >= MIN_FRAMES:
+        problems.append(
+            f"frame stamps: the intervals vary from {regularity.shortest_ns / 1e6:.2f} to "
+            f"{regularity.longest_ns / 1e6:.2f} ms (median {period_ms:.2f} ms), so the stamps cannot be "
+            "checked against a steady rate. Fix the camera's frame rate"
+        )
+    if regularity.jitter_ns > JITTER_NS:
+        sd_ns = np.hypot(sd_ns, regularity.jitter_ns)
+        problems.append(
+            f"frame stamps scatter by {regularity.jitter_ns / 1e6:.2g} ms (sd) about a steady period of "
+            f"{period_ms:.3f} ms: they were made late or rounded, or the camera is not free-running. Poses "
+            "are as unsure as the motion in that time"
+        )
+    strays = np.flatnonzero(regularity.stray_ns)
+    if strays.size:
+        worst = int(strays[np.argmax(np.abs(regularity.stray_ns[strays]))])
+        problems.append(
+            f"{strays.size} frame stamp{'' if strays.size == 1 else 's'} off a steady period of "
+            f"{period_ms:.3f} ms, most that of frame {worst} by {regularity.stray_ns[worst] / 1e6:+.2f} ms: "
+            "poses there are as unsure as the motion in that time"
+        )
+    level, levels_ns = 0.0, [0.0]
+    ends = [0, *(s.frame for s in regularity.steps), len(stamps_ns)]
+    for i, step in enumerate(regularity.steps, start=1):
+        split_ns = int(optical.t_ns[step.frame])
+        change = None
+        if imu is not None and alignment is not None:
+            change = offset_change(
+                optical, imu, alignment, split_ns=split_ns,
+                from_ns=max(int(optical.t_ns[ends[i - 1]]), split_ns - round(_WINDOW_S * 1e9)),
+                to_ns=min(int(optical.t_ns[ends[i + 1] - 1]), split_ns + round(_WINDOW_S * 1e9)),
+            )  # fmt: skip
+        verdict = _verdict(step, change)
+        if verdict != "paused":
+            level += step.size_ns
+            levels_ns.append(level)
+        problems.append(_step_words(step, regularity.period_ns, change, verdict))
+    spread_ns = max(levels_ns) - min(levels_ns)
+    if not regularity.steps and imu is not None and alignment is not None:
+        change = _change_of_halves(optical, imu, alignment)
+        if change is not None and abs(change.change_s) > _SIGMA * change.sd_s:
+            spread_ns = abs(change.change_s) * 1e9
+            problems.append(
+                "the offset of IMU and camera changes by "
+                f"{change.change_s * 1e3:+.1f} +- {change.sd_s * 1e3:.1g} ms from the first half of the run "
+                "to the second, by the rotations that both saw: the stamps of one of them step or drift. "
+                "Poses are as unsure as the motion in that time"
+            )
+    return StampCheck(regularity, np.hypot(sd_ns, spread_ns), tuple(problems))
+
+
+def _verdict(step: StampStep, change: OffsetChange | None) -> Literal["stamps", "paused", "unknown"]:
+    """Return what the motion says of a step: the stamps are wrong, the camera paused, or nothing."""
+    if change is None:
+        return "unknown"
+    if abs(change.change_s) > _SIGMA * change.sd_s:
+        return "stamps"
+    # Stamps that step up make the offset step down.
+    excluded = abs(change.change_s + step.size_ns * 1e-9) > _SIGMA * change.sd_s
+    return "paused" if excluded else "unknown"
+
+
+def _step_words(
+    step: StampStep,
+    period_ns: float,
+    change: OffsetChange | None,
+    verdict: Literal["stamps", "paused", "unknown"],
+) -> str:
+    found = (
+        f"frame stamps step by {step.size_ns / 1e6:+.2f} ms between frames {step.frame - 1} and "
+        f"{step.frame}: {step.interval_ns / 1e6:.2f} ms is {step.interval_ns / period_ns:.2f} periods of a "
+        f"steady {period_ns / 1e6:.3f} ms"
+    )
+    doubt = "Poses of the whole run are as unsure as the motion in that time"
+    if change is None:
+        return f"{found}. The motion does not tell whether the camera paused or the stamps are wrong. {doubt}"
+    size = f"{change.change_s * 1e3:+.1f} +- {change.sd_s * 1e3:.1g} ms"
+    moved = f"offset of IMU and camera changes there by {size}"
+    if verdict == "paused":
+        return f"{found}. The {moved}: the camera paused, and the stamps are believed"
+    if verdict == "stamps":
+        return f"{found}, and the {moved}: the stamps are wrong before it or after. {doubt}"
+    return f"{found}. The {moved}, too unsure to tell whether the stamps are wrong. {doubt}"
+
+
+def _change_of_halves(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> OffsetChange | None:
+    t_ns = optical.t_ns[has_pose(optical)]
+    return offset_change(
+        optical, imu, alignment,
+        split_ns=int(t_ns[len(t_ns) // 2]), from_ns=int(t_ns[0]), to_ns=int(t_ns[-1]),
+    )  # fmt: skip
