@@ -310,10 +310,14 @@ def camera_noise(
 
 
 def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> FloatArray:
-    """Return the covariance of the start values, shape (22, 22): wide where the first frames will tell."""
+    """Return the covariance of the start values, shape (22, 22): wide where the first frames will tell.
+
+    No wider than bricks move, though: what later frames leave of a variance is a difference, and of a square
+    metre rounding would leave more than is left of it in truth.
+    """
     s, a = settings, run.alignment
     sd = np.zeros(N_STATES)
-    sd[ATT], sd[POS], sd[VEL] = 0.2, 1.0, 1.0
+    sd[ATT], sd[POS], sd[VEL] = 0.2, 0.03, 1.0
     sd[BG], sd[BA], sd[GRAV] = s.gyro_bias_sd_radps, s.acc_bias_sd_mps2, 0.5
     if a.source == "data":
         sd[TAU] = max(s.offset_prior_sd_ns, a.offset_sd_ns) * 1e-9

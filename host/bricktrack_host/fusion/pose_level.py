@@ -79,7 +79,11 @@ def smooth_poses(runs: list[Run], settings: FusionSettings) -> list[Smoothed]:
     lins = [first_linearisation(run, settings) for run in runs]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
     starts = [_attitude_at_first_node(*three) for three in zip(runs, nodes, lins, strict=True)]
-    lins = [replace(lin, R_first=R) for lin, (R, _) in zip(lins, starts, strict=True)]
+    lins = [
+        replace(lin, R_first=R, p_first_m=run.p_seen_m[first] + run.R_seen[first] @ run.lever_arm_m)
+        for run, lin, (R, agrees) in zip(runs, lins, starts, strict=True)
+        for first in [int(np.argmax(agrees))]
+    ]
     used = [agrees for _, agrees in starts]
     first = settle_noise(runs, lins, nodes, used, settings)
     scales, levels = first.scales, first.levels
