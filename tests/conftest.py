@@ -8,6 +8,15 @@ import pytest
 
 # Simulated cameras, samplers and units run in real time there: one after the other, or they disturb each other.
 _IN_REAL_TIME = ("contract", "end_to_end", "unit/device", "virtual_pi")
+_AT_LEISURE = (  # of these, what only computes
+    "test_docs_commands.py",
+    "test_moving_camera.py",
+    "test_notebook.py",
+    "test_pages_in_a_browser.py",
+    "test_process.py",
+    "test_shared_sample.py",
+    "test_tutorial.py",
+)
 
 # A shell's background job ignores Ctrl-C, and hands that on to the programs that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -30,5 +39,5 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     tests = Path(__file__).parent
     real_time = [tests / folder for folder in _IN_REAL_TIME]
     for item in items:
-        keeps_time = any(item.path.is_relative_to(folder) for folder in real_time)
+        keeps_time = item.path.name not in _AT_LEISURE and any(map(item.path.is_relative_to, real_time))
         item.add_marker(pytest.mark.xdist_group("real time" if keeps_time else str(item.path)))

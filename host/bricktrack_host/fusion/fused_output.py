@@ -117,7 +117,8 @@ def sample_motion(
     unsure = (variance[:, 3:].max(axis=1) > settings.max_position_sd_mm**2) | (
         variance[:, :3].max(axis=1) > settings.max_rotation_sd_rad**2
     )
-    lost = outside | unsure
+    # What rounding has made less than nothing says nothing.
+    lost = outside | unsure | ~(variance > 0).all(axis=1)
     flags[lost] |= int(PoseFlag.NO_POSE)
     t_mm, v_mmps = 1e3 * p_out, 1e3 * v_out
     R_out, omega = R_out.copy(), omega.copy()
