@@ -5,7 +5,7 @@ tens of microseconds. Stamps that step or scatter by more were made elsewhere, o
 paused: where the brick turned on both sides, the inertial samples tell which.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.fusion.rotation_fit import Fit, RotationFit
-from bricktrack_host.fusion.sample_clock import RATE_SD
 from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
@@ -26,6 +25,7 @@ _MANY_STEPS = 0.05  # of the intervals: then the camera has no steady rate
 _WANDER = 2.5  # residual from a straight line in units of the local scatter; 1 where the rate is steady
 _WINDOW_S = 3.0  # of motion on either side of a step
 _CLOCK_RATE_SD = 1e-4  # of two crystals against each other
+_FREE_RATE_SD = 5e-3  # of a sensor's own clock, which a step may have falsified
 _FLOOR_S = 0.3e-3  # to which two fits of one offset agree, with all that their sd leave out
 _SIGMA = 4.0
 
@@ -192,6 +192,8 @@ def offset_change(
     """
     if alignment.source != "data":
         return None
+    # The skew of the whole run has taken up most of any step: each side begins without.
+    alignment = replace(alignment, skew=0.0)
     clock = alignment.sample_clock
     signal = ImuSignal.from_track(
         imu if clock is None else clock.restamp(imu), gyro_filter_s=alignment.gyro_filter_s
@@ -205,7 +207,7 @@ def offset_change(
     change_s, variance_s2 = 0.0, _FLOOR_S**2
     split_s = float(seconds_since(alignment.imu_time_ns(np.array([split_ns])), signal.epoch_ns)[0])
     for sign, (fit, mid_s) in ((-1.0, earlier), (1.0, later)):
-        # Each side's own rate carries it to the split: the whole run's has taken up part of any step.
+        # Each side's own rate carries it to the split.
         at_split = np.array([1.0, split_s - mid_s])
         change_s += sign * float(at_split @ [fit.offset_s, fit.skew])
         variance_s2 += float(at_split @ fit.covariance[:2, :2] @ at_split)
@@ -226,7 +228,7 @@ def _offset(
         optical.R_camera_brick[frames],
         np.maximum(sd_rad, MIN_ROTATION_SD_RAD),
         signal,
-        skew_prior_sd=_CLOCK_RATE_SD if alignment.sample_clock is None else RATE_SD,
+        skew_prior_sd=_CLOCK_RATE_SD if alignment.sample_clock is None else _FREE_RATE_SD,
     )
     fit = solver.solve(0.0)
     return None if fit is None else (fit, float(0.5 * (t_s[0] + t_s[-1])))
