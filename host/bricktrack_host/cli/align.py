@@ -13,7 +13,7 @@ from bricktrack_host.cli._units import JsonOption
 
 # What computes is imported by the command that runs it: SciPy, PyArrow and numba take a second to load.
 if TYPE_CHECKING:
-    from bricktrack_common.arrays import FloatArray
+    from bricktrack_common.arrays import FloatArray, IntArray
     from bricktrack_host.fusion.alignment_report import AlignmentReport
     from bricktrack_host.fusion.mount import Mount
     from bricktrack_host.tracks import ImuTrack, OpticalTrack
@@ -167,20 +167,20 @@ def _report(
     """Return the report, and whether the recording is a simulated one."""
     from bricktrack_host.fusion.alignment_report import report_alignment
 
-    own_clock, simulated = False, False
+    own_clock, simulated, stamps_ns = False, False, None
     if run is not None:
-        optical, samples, own_clock, simulated = _read_run(run)
+        optical, samples, stamps_ns, own_clock, simulated = _read_run(run)
     elif poses is not None and imu is not None:
         optical, samples = _read_files(poses, imu)
     sd_ms = stamps_sd_ms or 1e3 * (_STAMPS_SD_S if own_clock else within_s)
     report = report_alignment(
         optical, samples, lever_arm_mm=lever_arm_mm, prior_sd_ns=sd_ms * 1e6, max_offset_s=within_s,
-        with_mount=with_mount,
+        frame_stamps_ns=stamps_ns, with_mount=with_mount,
     )  # fmt: skip
     return report, simulated
 
 
-def _read_run(run: Path) -> "tuple[OpticalTrack, ImuTrack, bool, bool]":
+def _read_run(run: Path) -> "tuple[OpticalTrack, ImuTrack, IntArray, bool, bool]":
     from bricktrack_host.results.result_store import read_result, results_of
 
     result = read_result(results_of(run))
@@ -193,7 +193,8 @@ def _read_run(run: Path) -> "tuple[OpticalTrack, ImuTrack, bool, bool]":
             "there. How the clocks lie is in the run's report, under 'Camera and inertial sensor'"
         )
     own_clock = result.manifest.origin == "bricktrackd"
-    return result.optical, result.imu, own_clock, result.manifest.simulated
+    stamps_ns = result.observations.sensor_timestamp_ns
+    return result.optical, result.imu, stamps_ns, own_clock, result.manifest.simulated
 
 
 def _read_files(poses: Path, imu: Path) -> "tuple[OpticalTrack, ImuTrack]":
@@ -288,6 +289,8 @@ def _say(name: str, report: "AlignmentReport", chip: "dict[str, float | None]") 
     table.add_row("verdict", verdict)
     if f["remark"]:
         table.add_row("", str(f["remark"]))
+    for problem in report.stamps.problems:
+        table.add_row("", problem)
     out.print(table)
 
 

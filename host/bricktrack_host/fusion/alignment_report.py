@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bricktrack_common.arrays import FloatArray
+from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.estimate import FusionResult, fuse
+from bricktrack_host.fusion.frame_stamps import StampCheck, check_stamps
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.fusion.mount import Mount, refine_mount
 from bricktrack_host.fusion.rotation_fit import Correlation, correlate
@@ -27,6 +28,8 @@ class AlignmentReport:
     fused : FusionResult or None
         Where the lever arm is known: offset and skew by all that camera and IMU say, and the lag of the
         accelerometer behind the gyro.
+    stamps : StampCheck
+        What speaks against the frames' stamps.
     prior_offset_ns, prior_sd_ns : float, ns
         What the stamps promise.
     correlation : Correlation
@@ -41,6 +44,7 @@ class AlignmentReport:
 
     alignment: TimeAlignment
     fused: FusionResult | None
+    stamps: StampCheck
     prior_offset_ns: float
     prior_sd_ns: float
     correlation: Correlation
@@ -56,7 +60,10 @@ class AlignmentReport:
         found: dict[str, object] = {
             "source": "motion" if a.source == "data" else "stamps",
             "trusted": a.is_trusted,
-            "stamps_agree": not a.disagrees_with_stamps if a.source == "data" else None,
+            "stamps_agree": not (a.disagrees_with_stamps or self.stamps.is_contradicted)
+            if a.source == "data"
+            else None,
+            "stamps_problems": list(self.stamps.problems),
             "remark": a.reason,
             "offset_ms": a.offset_ns / 1e6,
             "offset_sd_ms": a.offset_sd_ns / 1e6,
@@ -113,6 +120,7 @@ def report_alignment(
     prior_offset_ns: float = 0.0,
     prior_sd_ns: float = 5e6,
     max_offset_s: float = 0.25,
+    frame_stamps_ns: IntArray | None = None,
     with_mount: bool = False,
 ) -> AlignmentReport:
     """Return what a recording tells of its clocks.
@@ -126,6 +134,9 @@ def report_alignment(
         What the stamps promise; a wide sd where camera and IMU were stamped by different clocks.
     max_offset_s : float
         How far from that to look.
+    frame_stamps_ns : ndarray of int64, shape (n_frames,), ns, optional
+        The sensor's stamps of all frames; the times of the poses if not given, which an exposure that varies
+        shifts.
     with_mount : bool
         Whether to refine where the sensor sits; needs the lever arm and a motion that tells the offset.
 
@@ -159,6 +170,9 @@ def report_alignment(
     return AlignmentReport(
         alignment=alignment,
         fused=fused,
+        stamps=check_stamps(
+            optical.t_ns if frame_stamps_ns is None else frame_stamps_ns, optical, imu, alignment
+        ),
         prior_offset_ns=prior_offset_ns,
         prior_sd_ns=prior_sd_ns,
         correlation=correlate(t_cam_s, R, signal, centre_s=prior_offset_ns * 1e-9, max_offset_s=max_offset_s),

@@ -245,11 +245,14 @@ class StampCheck:
         How unsure the instant of each frame is for it; zero where nothing speaks against the stamps.
     problems : tuple of str
         In words.
+    is_contradicted : bool
+        Whether the motion says that they are wrong somewhere, or those of the inertial samples.
     """
 
     regularity: StampRegularity
     sd_ns: FloatArray
     problems: tuple[str, ...]
+    is_contradicted: bool
 
 
 def check_stamps(
@@ -293,7 +296,7 @@ def check_stamps(
             f"{period_ms:.3f} ms, most that of frame {worst} by {regularity.stray_ns[worst] / 1e6:+.2f} ms: "
             "poses there are as unsure as the motion in that time"
         )
-    level, levels_ns = 0.0, [0.0]
+    is_contradicted, level, levels_ns = False, 0.0, [0.0]
     ends = [0, *(s.frame for s in regularity.steps), len(stamps_ns)]
     for i, step in enumerate(regularity.steps, start=1):
         split_ns = int(optical.t_ns[step.frame])
@@ -305,6 +308,7 @@ def check_stamps(
                 to_ns=min(int(optical.t_ns[ends[i + 1] - 1]), split_ns + round(_WINDOW_S * 1e9)),
             )  # fmt: skip
         verdict = _verdict(step, change)
+        is_contradicted |= verdict == "stamps"
         if verdict != "paused":
             level += step.size_ns
             levels_ns.append(level)
@@ -313,14 +317,14 @@ def check_stamps(
     if not regularity.steps and imu is not None and alignment is not None:
         change = _change_of_halves(optical, imu, alignment)
         if change is not None and abs(change.change_s) > _SIGMA * change.sd_s:
-            spread_ns = abs(change.change_s) * 1e9
+            is_contradicted, spread_ns = True, abs(change.change_s) * 1e9
             problems.append(
                 "the offset of IMU and camera changes by "
                 f"{change.change_s * 1e3:+.1f} +- {change.sd_s * 1e3:.1g} ms from the first half of the run "
                 "to the second, by the rotations that both saw: the stamps of one of them step or drift. "
                 "Poses are as unsure as the motion in that time"
             )
-    return StampCheck(regularity, np.hypot(sd_ns, spread_ns), tuple(problems))
+    return StampCheck(regularity, np.hypot(sd_ns, spread_ns), tuple(problems), is_contradicted)
 
 
 def _verdict(step: StampStep, change: OffsetChange | None) -> Literal["stamps", "paused", "unknown"]:

@@ -1,6 +1,7 @@
 """`bricktrack align` on files, and what it says of clocks that are known (simulated shakes)."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,6 +98,19 @@ def test_with_the_lever_arm_the_lag_of_the_accelerometer_is_found(shake, tmp_pat
     assert np.nanmedian(off) < np.radians(0.1 * np.sqrt(2) * 30)
     save_alignment_plot(report, tmp_path / "clocks.svg", title="simulated")
     assert "<svg" in (tmp_path / "clocks.svg").read_text()
+
+
+def test_frame_stamps_that_step_are_told(shake):
+    t_ns = shake.optical.t_ns.copy()
+    t_ns[len(t_ns) // 2 :] += 5_000_000
+    report = report_alignment(
+        replace(shake.optical, t_ns=t_ns), shake.imu, prior_sd_ns=2e9, max_offset_s=2.0, frame_stamps_ns=t_ns
+    )
+    found = report.figures()
+    assert found["stamps_agree"] is False
+    assert "frame stamps step by" in found["stamps_problems"][0]
+    steady = report_alignment(shake.optical, shake.imu, prior_sd_ns=2e9, max_offset_s=2.0).figures()
+    assert steady["stamps_agree"] is True and steady["stamps_problems"] == []
 
 
 def test_what_is_missing_or_contradictory_is_named(files, tmp_path):
