@@ -5,7 +5,7 @@ either on a machine with other work:
 
     python scripts/bench_decode.py runs/sample_motion --threads 2
 
-Without a run it takes the simulated recording of ``bench_process.py``.
+Without a run it takes the simulated recording that ``bench_process.py`` takes.
 """
 
 import argparse
@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import av
+from recording_to_time import simulated_recording
 
 from bricktrack_common.run_folder import read_run
 from bricktrack_host.recordings.video_frames import decode_run_video
@@ -41,8 +42,6 @@ def main() -> None:
     options = parser.parse_args()
     folder = options.run
     if folder is None:
-        from bench_process import simulated_recording
-
         folder, _, _ = simulated_recording()
     run = read_run(folder)
     if run.video is None or run.frames is None:

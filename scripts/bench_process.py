@@ -13,7 +13,6 @@ import argparse
 import os
 import resource
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,11 +25,11 @@ from typing import TypeVar
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before NumPy is loaded
 
 from bench_decode import bare_decode
+from recording_to_time import simulated_recording
 
 from bricktrack_common.run_folder import Run, read_run
 from bricktrack_host.pipeline import process_run
 
-DURATION_S = 15
 DECODER_THREADS = 2  # those of `decode_run_video`
 T = TypeVar("T")
 
@@ -84,23 +83,6 @@ class StageClock:
             self.cpu_s[name] = time.process_time() - cpu
             self.peak_mb[name] = _peak_mb()
         self._now = None
-
-
-def simulated_recording(duration_s: int = DURATION_S) -> tuple[Path, Path, Path]:
-    """Return run folder, calibration and layout of a simulated recording, made now or at an earlier time."""
-    folder = Path(tempfile.gettempdir()) / f"bricktrack-bench-{duration_s}s"
-    found = sorted(folder.glob("runs/*/manifest.json"))
-    if not found or not (folder / "calibration.json").is_file():
-        print(f"recording {duration_s} s with 'bricktrack demo' into {folder} ...", flush=True)
-        command = [sys.executable, "-m", "bricktrack_host.cli", "demo"]
-        done = subprocess.run(
-            [*command, "--folder", str(folder), "--duration", str(duration_s)],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        found = sorted(folder.glob("runs/*/manifest.json"))
-        if done.returncode or not found:
-            raise SystemExit(f"'bricktrack demo' ended with {done.returncode}:\n{done.stderr}")
-    return found[0].parent, folder / "calibration.json", folder / "kit" / "layout.toml"
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ from statistics import median
 
 import msgspec
 import psutil
-from bench_process import simulated_recording
+from recording_to_time import simulated_recording
 
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.run_folder import read_run
