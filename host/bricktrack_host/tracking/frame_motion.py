@@ -20,7 +20,7 @@ _MAX_GAP_PERIODS = 3.5  # wider gaps end a spline: a shaken brick turns back wit
 _SPLINE_SHARE = 0.1
 _TWIST_FLOOR = np.array([0.005, 0.3])  # rad/s, mm/s: far below what moves a centroid within a frame
 _FUSED_TWIST_SD = np.repeat([0.03, 5.0], 3)  # rad/s, mm/s: of the fused motion between frames
-_UNKNOWN_TWIST = np.array([1.0, 1.0, 1.0, 300.0, 300.0, 300.0])
+UNKNOWN_TWIST_SD = np.array([1.0, 1.0, 1.0, 300.0, 300.0, 300.0])
 """Of a shaken brick (DESIGN 2: 0.3 m/s), where the neighbours do not say."""
 
 
@@ -65,7 +65,7 @@ def motion_to_leds(
     """Return how far the brick moves from each frame's instant to each LED's, by splines over frames."""
     n, n_leds = led_t_ns.shape
     rvec, shift = np.zeros((n, n_leds, 3)), np.zeros((n, n_leds, 3))
-    twist_sd = np.tile(_UNKNOWN_TWIST, (n, 1))
+    twist_sd = np.tile(UNKNOWN_TWIST_SD, (n, 1))
     valid = np.flatnonzero(all_finite(R_camera_brick, 2))
     if valid.size >= 2:
         seconds = (t_ns - t_ns[valid[0]]) * 1e-9
@@ -159,11 +159,11 @@ def _twist_sd(samples: FloatArray, period_s: float) -> FloatArray:
     """
     n = len(samples)
     if n < 5:
-        return np.tile(_UNKNOWN_TWIST, (n, 1))
+        return np.tile(UNKNOWN_TWIST_SD, (n, 1))
     fourth = np.diff(samples, 4, axis=0)
     size = np.stack([np.linalg.norm(fourth[:, :3], axis=1), np.linalg.norm(fourth[:, 3:], axis=1)], axis=1)
     near = np.pad(size, ((4, 4), (0, 0)), mode="edge")  # frame i is centred among those from i to i + 4
     local = np.max([near[k : k + n] for k in range(5)], axis=0)
     sd = np.maximum(_SPLINE_SHARE * local / period_s, _TWIST_FLOOR)
     sd[[0, 1, -2, -1]] *= 3.0
-    return np.asarray(np.repeat(np.minimum(sd, _UNKNOWN_TWIST[[0, 3]]), 3, axis=1))
+    return np.asarray(np.repeat(np.minimum(sd, UNKNOWN_TWIST_SD[[0, 3]]), 3, axis=1))

@@ -10,17 +10,25 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter, median_filter
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_host.tracking.correspondence import search_correspondence
 from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.identity_motion import (
+    RunMotion,
+    poses_between,
+    run_motion,
+    turn_between,
+    unknown_motion,
+)
 from bricktrack_host.tracking.led_profile import predict_brick
 from bricktrack_host.tracking.paper_rules import identify_by_paper
-from bricktrack_host.tracking.pattern import NOT_FOLLOWED, follow_pattern
+from bricktrack_host.tracking.pattern import NOT_FOLLOWED, assign_predicted, follow_pattern
 from bricktrack_host.tracking.prsoi import ROUGH_MM, prsoi_starts
+from bricktrack_host.tracking.refine import LedMotion
 from bricktrack_host.tracking.segment import Blobs
 from bricktrack_host.tracking.verification import (
     MIN_INLIERS,
@@ -29,6 +37,7 @@ from bricktrack_host.tracking.verification import (
     RunLights,
     Verified,
     identity_gate_px,
+    motion_of,
     verify,
 )
 
@@ -37,6 +46,13 @@ SegmentMethod = Literal["default", "paper"]
 _MAX_COAST_NS = 500_000_000  # after so long without LEDs the last pattern says nothing of a shaken brick
 
 _SUSPECT, _NEAR_FRAMES = 3.0, 9
+_MOVED_PX = 0.5  # residuals beyond this may be a motion's
+_LEAST_GATE_PX = 0.5
+_LEAST_TURN_RAD = 0.01
+_MOST_TURN_RAD = 0.1
+_SAME_TURN = 0.7
+_NEAR_TURNS = 31
+_WARM_ROUNDS, _SETTLE_ROUNDS = 2, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +108,7 @@ def identify_run(
         if run.search(i).n_found:
             run.follow(i)
         i = run.next_open(i + 1)
+    run.settle()
     run.take_strayed_lights()
     return run.result
 
@@ -204,6 +221,19 @@ class _Run:
             again = self._verify(lights.take(wrong), start, intruders=False)
             more = again.kept.sum(axis=1) > kept[wrong]
             verified = verified.replaced(wrong[more], again.take(np.flatnonzero(more)))
+        moved = np.flatnonzero(~_is_whole(verified, lights) | (_rms_px(verified) > _MOVED_PX))
+        if moved.size:
+            # Read out row by row, a brick in motion is out of shape.
+            some = lights.take(moved)
+            known = all_finite(verified.poses.R_camera_brick[moved], 2)
+            start = (
+                np.where(known[:, None, None], verified.poses.R_camera_brick[moved], starts[0][moved]),
+                np.where(known[:, None], verified.poses.t_camera_brick_mm[moved], starts[1][moved]),
+            )
+            motion = unknown_motion(some.uv_px, self._rays)
+            again = self._verify(some, start, intruders=False, motion=motion)
+            more = again.kept.sum(axis=1) >= verified.kept[moved].sum(axis=1)
+            verified = verified.replaced(moved[more], again.take(np.flatnonzero(more)))
         # A moving brick's residuals scatter, alike from frame to frame; where one frame's are far larger than
         # its neighbours', a false light may be among its own.
         rms = _rms_px(verified)
@@ -217,7 +247,13 @@ class _Run:
         return verified.replaced(suspect, again)
 
     def _verify(
-        self, lights: LedLights, starts: tuple[FloatArray, FloatArray], *, intruders: bool = True
+        self,
+        lights: LedLights,
+        starts: tuple[FloatArray, FloatArray],
+        *,
+        intruders: bool = True,
+        motion: LedMotion | None = None,
+        gate_px: FloatArray | None = None,
     ) -> Verified:
         return verify(
             lights,
@@ -225,8 +261,9 @@ class _Run:
             self._rays,
             self._brick,
             collar_mm=self._collar_mm,
-            gate_px=self._gate_px,
+            gate_px=self._gate_px if gate_px is None else gate_px,
             intruders=intruders,
+            motion=motion,
         )
 
     def _take(self, frames: IntArray, assigned: IntArray, verified: Verified, better: BoolArray) -> None:
@@ -245,6 +282,193 @@ class _Run:
         verified = self._verify(self._lights.of_leds(at, assigned), start, intruders=False)
         more = verified.kept.sum(axis=1) > (self.result.blob_of_led[at] >= 0).sum(axis=1)
         self._take(at, assigned, verified, more)
+
+    def settle(self) -> None:
+        """Judge every frame by how the run moves: its shape is then known, and the gate its neighbours' own.
+
+        Frames that scatter beyond their neighbours are identified again, from where the others show the LEDs;
+        what then does not fit is refused.
+        """
+        for round_ in range(_WARM_ROUNDS + _SETTLE_ROUNDS):
+            frames = np.flatnonzero((self.result.blob_of_led >= 0).any(axis=1))
+            if frames.size < _NEAR_FRAMES:
+                return
+            assigned = self.result.blob_of_led[frames]
+            lights = self._lights.of_leds(frames, assigned)
+            motion = self._motion()
+            verified = self._verify_known(
+                frames, lights, motion.within, motion, self._gate_px, intruders=False
+            )
+            before = self.result.blob_of_led.copy()
+            if (
+                round_ < _WARM_ROUNDS and np.median(_scatter_px(verified)) > _LEAST_GATE_PX / _SUSPECT
+            ):  # poses first, which the motion between them makes better
+                self._take(frames, assigned, verified, _is_whole(verified, lights))
+                continue
+            usual = median_filter(_scatter_px(verified), _NEAR_FRAMES, mode="nearest")
+            tight = np.clip(_SUSPECT * usual, _LEAST_GATE_PX, self._gate_px)
+            good = _is_whole(verified, lights) & (_scatter_px(verified) <= tight)
+            bad = np.flatnonzero(~good)
+            if bad.size:  # the spline may be a neighbour's fault
+                some = lights.take(bad)
+                unknown = unknown_motion(some.uv_px, self._rays)
+                again = self._verify_known(frames[bad], some, unknown, motion, self._gate_px, intruders=False)
+                fits = _is_whole(again, some) & (_scatter_px(again) <= tight[bad])
+                verified = verified.replaced(bad[fits], again.take(np.flatnonzero(fits)))
+                good[bad[fits]] = True
+            self._take(frames, assigned, verified, good)
+            tight_px = np.interp(np.arange(len(self._blobs)), frames, tight)
+            limit = self._mend_lurches(tight_px)
+            self._refuse(frames[~good])
+            self._again(tight_px, limit)
+            if (self.result.blob_of_led == before).all():
+                return
+
+    def _mend_lurches(self, tight_px: FloatArray) -> FloatArray:
+        """Leave out the one LED without which a frame does not turn away from its neighbours.
+
+        Some LEDs decide the attitude nearly alone: a false light in one's place turns the pose, and fits.
+        Where the frame turns without any of them as well, it is the brick that did.
+        Returns the turns that are usual, rad, shape (n,).
+        """
+        R, t = self.result.R_camera_brick, self.result.t_camera_brick_mm
+        between, _ = poses_between(self._stamps_ns, R, t)
+        turn = turn_between(R, between)
+        n_found = (self.result.blob_of_led >= 0).sum(axis=1)
+        known = np.flatnonzero(n_found)
+        lone = np.isnan(turn[known]) & (n_found[known] <= MIN_INLIERS)
+        lone[:2], lone[-2:] = False, False
+        self._refuse(known[lone])  # four lights fit by chance, and no frame beside them bears them out
+        judged = np.flatnonzero(np.isfinite(turn))
+        if judged.size == 0:
+            return np.full(len(R), _LEAST_TURN_RAD)
+        usual = median_filter(turn[judged], _NEAR_TURNS)
+        usual = np.interp(np.arange(len(R)), judged, usual)
+        turn = np.nan_to_num(turn)
+        limit = np.clip(_SUSPECT * usual, _LEAST_TURN_RAD, _MOST_TURN_RAD)
+        frames = np.flatnonzero(turn > limit)
+        if frames.size == 0:
+            return limit
+        row, led = np.nonzero(self.result.blob_of_led[frames] >= 0)
+        tried = self.result.blob_of_led[frames[row]]
+        tried[np.arange(len(row)), led] = -1
+        at = frames[row]
+        lights = self._lights.of_leds(at, tried)
+        known_R = np.where(np.isfinite(between), between, R)
+        worst = turn >= maximum_filter(turn, 5, mode="nearest")
+        rest = np.where((worst & (turn > limit))[:, None, None], np.nan, R)
+        motion = motion_of(self._motion(rest).within, at)
+        gate = np.where(lights.is_whole, tight_px[at][:, None], self._gate_px)
+        verified = self._verify(lights, (known_R[at], t[at]), intruders=False, motion=motion, gate_px=gate)
+        kept = verified.kept.sum(axis=1)
+        left = turn_between(verified.poses.R_camera_brick, between[at])
+        left = np.where(_is_whole(verified, lights) & (kept >= MIN_INLIERS), left, np.nan)
+        calm = np.nan_to_num(left, nan=np.inf) <= limit[at]
+        best = np.full(frames.size, -1)
+        for i in np.unique(row[calm]):
+            mine = np.flatnonzero((row == i) & calm)
+            best[i] = mine[verified.log_evidence[mine].argmax()]
+        # A frame that is off turns its neighbours' cubics too, by less.
+        mendable = np.zeros(len(R))
+        mendable[frames] = np.where(best >= 0, turn[frames], 0.0)
+        first = (best >= 0) & (turn[frames] >= maximum_filter(mendable, 5, mode="nearest")[frames])
+        mended = best[first]
+        self._take(at[mended], tried[mended], verified.take(mended), np.ones(mended.size, dtype=bool))
+        least = np.full(frames.size, np.inf)
+        np.fmin.at(least, row, left)
+        few = (self.result.blob_of_led[frames] >= 0).sum(axis=1) <= MIN_INLIERS
+        doubtful = few | ~(least > _SAME_TURN * turn[frames]) | np.isinf(least)
+        self._refuse(frames[doubtful & worst[frames] & (best < 0)])
+        return limit
+
+    def _again(self, tight_px: FloatArray, limit_rad: FloatArray) -> None:
+        """Identify frames without an identity, and LEDs without a light, from where the run shows them."""
+        motion = self._motion()
+        n_found = (self.result.blob_of_led >= 0).sum(axis=1)
+        known = all_finite(motion.R_camera_brick, 2) & (self._lights.count >= MIN_INLIERS)
+        frames = np.flatnonzero(known & (n_found < self._n_leds))
+        if frames.size == 0:
+            return
+        new = np.full((frames.size, self._n_leds), -1, dtype=np.int64)
+        for row, i in enumerate(frames):
+            begin, end = self._lights.first[i : i + 2]
+            limit = 4 * self._radius_px if n_found[i] == 0 else self._gate_px
+            new[row] = assign_predicted(
+                self._lights.uv_px[begin:end],
+                motion.uv_px[i],
+                gate_px=0.7 * self._radius_px if n_found[i] == 0 else self._gate_px,
+                shift_limit_px=limit,
+            )
+        changed = (new != self.result.blob_of_led[frames]).any(axis=1) & (
+            (new >= 0).sum(axis=1) >= MIN_INLIERS
+        )
+        frames, new = frames[changed], new[changed]
+        if frames.size == 0:
+            return
+        lights = self._lights.of_leds(frames, new)
+        verified = self._verify_known(frames, lights, motion.within, motion, tight_px, intruders=True)
+        better = self._is_better(frames, verified, motion, n_found, limit_rad)
+        rest = np.flatnonzero(~better)
+        if rest.size:
+            some = lights.take(rest)
+            unknown = unknown_motion(some.uv_px, self._rays)
+            again = self._verify_known(frames[rest], some, unknown, motion, tight_px, intruders=True)
+            more = self._is_better(frames[rest], again, motion, n_found, limit_rad)
+            verified = verified.replaced(rest[more], again.take(np.flatnonzero(more)))
+            better[rest[more]] = True
+        self._take(frames, new, verified, better)
+        self.result.is_ambiguous[frames[better]] = False
+
+    def _is_better(
+        self,
+        frames: IntArray,
+        verified: Verified,
+        motion: RunMotion,
+        n_found: IntArray,
+        limit_rad: FloatArray,
+    ) -> BoolArray:
+        """Tell which frames have more LEDs than were found, without a turn."""
+        turn = turn_between(verified.poses.R_camera_brick, motion.R_camera_brick[frames])
+        calm = np.nan_to_num(turn, nan=np.inf) <= np.maximum(limit_rad[frames], 3 * _LEAST_TURN_RAD)
+        return np.asarray(calm & (verified.kept.sum(axis=1) > n_found[frames]))
+
+    def _motion(self, R: FloatArray | None = None) -> RunMotion:
+        blob = self.result.blob_of_led
+        every = self._lights.of_leds(np.arange(len(blob)), blob)
+        return run_motion(
+            self._stamps_ns,
+            every.uv_px,
+            self.result.R_camera_brick if R is None else R,
+            self.result.t_camera_brick_mm,
+            self._rays,
+            self._brick,
+            collar_mm=self._collar_mm,
+        )
+
+    def _verify_known(
+        self,
+        frames: IntArray,
+        lights: LedLights,
+        within: LedMotion,
+        motion: RunMotion,
+        gate_px: FloatArray | float,
+        *,
+        intruders: bool,
+    ) -> Verified:
+        """Verify assignments of frames whose motion is known; what is cut may be off by the usual gate."""
+        gate = np.broadcast_to(np.asarray(gate_px, dtype=np.float64), len(self._blobs))[frames]
+        return self._verify(
+            lights,
+            (motion.R_camera_brick[frames], motion.t_camera_brick_mm[frames]),
+            intruders=intruders,
+            motion=within if len(within.dt_s) == len(frames) else motion_of(within, frames),
+            gate_px=np.where(lights.is_whole, gate[:, None], self._gate_px),
+        )
+
+    def _refuse(self, frames: IntArray) -> None:
+        self.result.blob_of_led[frames] = -1
+        self.result.R_camera_brick[frames] = np.nan
+        self.result.t_camera_brick_mm[frames] = np.nan
 
     def take_strayed_lights(self) -> None:
         """Give LEDs without a light a free one within the gate, as strayed: see `Identities.is_strayed`."""
@@ -269,6 +493,17 @@ class _Run:
                 out[row, k] = nearest
         more = (out != self.result.blob_of_led[frames]).any(axis=1)
         return frames[more], out[more]
+
+
+def _is_whole(verified: Verified, lights: LedLights) -> BoolArray:
+    """Tell which assignments are believed with all their LEDs."""
+    return np.asarray(verified.kept.sum(axis=1) == all_finite(lights.uv_px).sum(axis=1))
+
+
+def _scatter_px(verified: Verified) -> FloatArray:
+    """Return the root of the squared residuals per degree of freedom; 0 where there is no pose."""
+    squares = np.where(verified.kept, (verified.poses.residual_px**2).sum(axis=-1), 0.0).sum(axis=1)
+    return np.asarray(np.sqrt(squares / np.maximum(2 * verified.kept.sum(axis=1) - 6, 1)))
 
 
 def _rms_px(verified: Verified) -> FloatArray:

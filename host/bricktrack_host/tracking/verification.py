@@ -16,7 +16,7 @@ from bricktrack_host.tracking.evidence import Evidence, evidence_of
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_profile import shift_per_radius
 from bricktrack_host.tracking.prsoi import ROUGH_MM, prsoi_starts
-from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
+from bricktrack_host.tracking.refine import LedMotion, RefinedPoses, refine_poses
 from bricktrack_host.tracking.segment import Blobs
 
 MIN_INLIERS = 4
@@ -202,6 +202,7 @@ def verify(
     gate_px: FloatArray | float,
     picture: IntArray | None = None,
     intruders: bool = True,
+    motion: LedMotion | None = None,
 ) -> Verified:
     """Fit poses to assignments and keep the LEDs that each pose explains.
 
@@ -211,12 +212,14 @@ def verify(
         Of each LED under each of n assignments.
     starts : (R, t) or None
         Shapes (n, 3, 3) and (n, 3); `None`: by PRSOI.
-    gate_px : float or ndarray, shape (n,)
+    gate_px : float or ndarray, shape (n,) or (n, n_leds)
         Largest residual that is believed.
     picture : ndarray of int64, shape (n,), optional
         Assignments of one picture compete: the hopeless are not looked at further. Default: each has its own.
     intruders : bool
         False: LEDs are left out only beyond the gate, however much the residuals scatter.
+    motion : LedMotion, optional
+        How the brick moves within each of the n pictures, read out row by row; default: not at all.
 
     Notes
     -----
@@ -228,15 +231,26 @@ def verify(
     uv = lights.uv_px.copy()
     n = len(uv)
     R, t = starts if starts is not None else prsoi_starts(uv, ray_model, brick_model, tolerance_mm=ROUGH_MM)
-    gate = np.broadcast_to(np.asarray(gate_px, dtype=np.float64), n)
+    gate = np.asarray(gate_px, dtype=np.float64)
+    gate = np.broadcast_to(gate[:, None] if gate.ndim == 1 else gate, uv.shape[:2])
     picture = np.arange(n) if picture is None else picture
     mode = ray_model.sensor_mode
-    variance = np.where(lights.is_whole, _IDENTITY_SD_PX**2, (_CUT_SD_GATES * gate[:, None]) ** 2)
+    variance = np.where(lights.is_whole, _IDENTITY_SD_PX**2, (_CUT_SD_GATES * gate) ** 2)
     cov = variance[..., None, None] * np.eye(2)
     shift_sd = None if collar_mm is None else shift_per_radius(collar_mm, brick_model)
 
     def fit(rows: IntArray, uv: FloatArray, R: FloatArray, t: FloatArray) -> tuple[RefinedPoses, Evidence]:
-        poses = refine_poses(uv, cov[rows], R, t, ray_model, brick_model, collar_mm=collar_mm, max_steps=6)
+        poses = refine_poses(
+            uv,
+            cov[rows],
+            R,
+            t,
+            ray_model,
+            brick_model,
+            collar_mm=collar_mm,
+            motion=None if motion is None else motion_of(motion, rows),
+            max_steps=6,
+        )
         some = lights.take(rows)
         return poses, evidence_of(
             poses.residual_px,
@@ -296,11 +310,21 @@ def verify(
     return Verified(kept, poses, np.where(kept.any(axis=1), evidence.log_ratio, -np.inf))
 
 
+def motion_of(motion: LedMotion, rows: IntArray) -> LedMotion:
+    """Return the motion within some of the pictures."""
+    return LedMotion(
+        rvec_brick_rad=motion.rvec_brick_rad[rows],
+        shift_camera_mm=motion.shift_camera_mm[rows],
+        dt_s=motion.dt_s[rows],
+        twist_sd=None if motion.twist_sd is None else motion.twist_sd[rows],
+    )
+
+
 def _beyond(uv: FloatArray, poses: RefinedPoses, gate: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the residuals' lengths, and which LEDs are beyond the gate or cannot be seen, (n, n_leds)."""
     seen = all_finite(uv)
     length = np.where(seen, np.nan_to_num(np.linalg.norm(poses.residual_px, axis=-1), nan=np.inf), 0.0)
-    return length, seen & ~((length <= gate[:, None]) & (poses.facing > MIN_FACING))
+    return length, seen & ~((length <= gate) & (poses.facing > MIN_FACING))
 
 
 def identity_gate_px(radius_px: float) -> float:
