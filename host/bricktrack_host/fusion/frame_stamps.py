@@ -324,6 +324,16 @@ def check_stamps(
                 "to the second, by the rotations that both saw: the stamps of one of them step or drift. "
                 "Poses are as unsure as the motion in that time"
             )
+        elif alignment.source == "data" and abs(alignment.skew) > _SIGMA * np.hypot(
+            alignment.skew_sd, _CLOCK_RATE_SD
+        ):
+            span_ns = float(optical.t_ns[-1] - optical.t_ns[0])
+            is_contradicted, spread_ns = True, 0.5 * abs(alignment.skew) * span_ns
+            problems.append(
+                f"the clocks of IMU and camera run apart by {alignment.skew * 1e6:.0f} ppm, by the rotations "
+                "that both saw, where crystals hold 100: one of the two is scaled. Poses are as unsure as "
+                f"the motion in the {spread_ns / 1e6:.1f} ms that come together to either end of the run"
+            )
     return StampCheck(regularity, np.hypot(sd_ns, spread_ns), tuple(problems), is_contradicted)
 
 

@@ -24,6 +24,9 @@ from bricktrack_host.fusion.smoother import (
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import FusedTrack
 
+# The velocity comes from poses at the same stamps: its own share that is unsure, in any direction.
+_UNSURE_VELOCITY = 0.3
+
 
 def sample_motion(
     run: Run,
@@ -204,6 +207,9 @@ def unsure_times(
         # The mean of the velocities at both ends: where the motion turns round, it still went somewhere.
         moved = 0.5 * (now + twist_at(t_s + side * sd_s)) * sd_s[:, None]
         covariance += 0.5 * moved[:, :, None] * moved[:, None, :]
+        for part in (slice(0, 3), slice(3, 6)):
+            aside = np.einsum("ni,ni->n", moved[:, part], moved[:, part])[:, None, None] * np.eye(3)
+            covariance[:, part, part] += 0.5 * _UNSURE_VELOCITY**2 * aside
     return covariance, flags
 
 
