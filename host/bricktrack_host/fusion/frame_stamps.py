@@ -1,8 +1,7 @@
 """Whether the frames' stamps can be right, by the camera's steady rate and by the inertial samples.
 
-The sensor of a free-running camera keeps its period to parts in a million, and the kernel stamps it to some
-tens of microseconds. Stamps that step or scatter by more were made elsewhere, or edited, or the camera
-paused: where the brick turned on both sides, the inertial samples tell which.
+Stamps that step or scatter were made elsewhere, or edited, or the camera paused: where the brick turned on
+both sides, the inertial samples tell which.
 """
 
 from dataclasses import dataclass, replace
@@ -13,16 +12,16 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.fusion.rotation_fit import Fit, RotationFit
+from bricktrack_host.fusion.stamp_regularity import (
+    JITTER_NS,
+    MIN_FRAMES,
+    StampRegularity,
+    StampStep,
+    stamp_regularity,
+)
 from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
-MIN_FRAMES = 12
-JITTER_NS = 100e3  # at 0.25 m/s 0.025 mm, what a good pose is unsure of anyway
-_STEP_NS = 2 * JITTER_NS
-_STEP_SIGMA = 6.0
-_BESIDE = 5  # intervals on either side that say what is usual there
-_MANY_STEPS = 0.05  # of the intervals: then the camera has no steady rate
-_WANDER = 2.5  # residual from a straight line in units of the local scatter; 1 where the rate is steady
 _WINDOW_S = 3.0  # of motion on either side of a step
 _CLOCK_RATE_SD = 1e-4  # of two crystals against each other
 _FREE_RATE_SD = 5e-3  # of a sensor's own clock, which a step may have falsified
@@ -31,143 +30,11 @@ _SIGMA = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class StampStep:
-    """A place where the interval between two stamps is not a whole number of periods, and stays so.
-
-    Attributes
-    ----------
-    frame : int
-        The first frame after it, from 0.
-    interval_ns : float
-        Between the stamps of that frame and the one before.
-    size_ns : float
-        What the interval has more than the nearest whole number of periods.
-    """
-
-    frame: int
-    interval_ns: float
-    size_ns: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StampRegularity:
-    """How regular the stamps of a run are.
-
-    Attributes
-    ----------
-    is_steady : bool
-        Whether there is a steady rate to compare with; without it nothing below is found.
-    period_ns : float
-        Steady: the fitted period; else the median interval. NaN for fewer than two frames.
-    shortest_ns, longest_ns : float
-        Interval, dropped frames taken out; NaN as above.
-    jitter_ns : float
-        Standard deviation of single stamps about the steady rate, steps and strays left out.
-    steps : tuple of StampStep
-    stray_ns : ndarray, shape (n_frames,)
-        How far single stamps lie off where their neighbours lie on; zero for all others.
-    """
-
-    is_steady: bool
-    period_ns: float
-    shortest_ns: float
-    longest_ns: float
-    jitter_ns: float
-    steps: tuple[StampStep, ...]
-    stray_ns: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
 class OffsetChange:
     """By how much the offset of IMU and camera differs between two stretches of a run, s, by rotations."""
 
     change_s: float
     sd_s: float
-
-
-def stamp_regularity(stamps_ns: IntArray) -> StampRegularity:
-    """Return how regular the frames' stamps are. Dropped frames, whole periods, do not count against them.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n_frames,), ns, rising
-    """
-    n = len(stamps_ns)
-    intervals = np.diff(stamps_ns).astype(np.float64)
-    none = np.zeros(n)
-    if n < MIN_FRAMES:
-        shortest, median, longest = (
-            (intervals.min(), np.median(intervals), intervals.max()) if n > 1 else (np.nan,) * 3
-        )
-        return StampRegularity(False, float(median), float(shortest), float(longest), 0.0, (), none)
-    period = float(np.median(intervals))
-    number = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(intervals / period), 1.0))])
-    # Over several periods: stamps rounded to milliseconds have no typical interval of their own.
-    far = min(10, n // 8) or 1
-    since = (stamps_ns - stamps_ns[0]).astype(np.float64)
-    period = float(np.median((since[far:] - since[:-far]) / (number[far:] - number[:-far])))
-    excess = intervals - np.diff(number) * period
-    steps, stray = _steps_and_strays(excess)
-    sizes = dict(steps)
-    steady = since.copy()
-    for k, size in steps:
-        steady[k + 1 :] -= size
-    keep = stray == 0
-    line = np.polyfit(number[keep], steady[keep], 1)
-    residual = (steady - np.polyval(line, number))[keep]
-    inside = keep[:-2] & keep[1:-1] & keep[2:]
-    bend = (np.diff(steady, 2) - np.diff(number, 2) * line[0])[inside]
-    local = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6) if len(bend) else 0.0
-    wander = float(np.sqrt(np.mean(residual**2)))
-    one = intervals / np.diff(number)
-    is_steady = wander <= _WANDER * max(local, JITTER_NS) and len(steps) <= max(2, _MANY_STEPS * n)
-    return StampRegularity(
-        is_steady=bool(is_steady),
-        period_ns=float(line[0]) if is_steady else float(np.median(intervals)),
-        shortest_ns=float(one.min()),
-        longest_ns=float(one.max()),
-        jitter_ns=wander if is_steady else 0.0,
-        steps=tuple(StampStep(k + 1, float(intervals[k]), size) for k, size in sizes.items())
-        if is_steady
-        else (),
-        stray_ns=stray if is_steady else none,
-    )
-
-
-def _steps_and_strays(excess_ns: FloatArray) -> tuple[list[tuple[int, float]], FloatArray]:
-    """Return the intervals that stand out of those beside them for good, with sizes, and stamps off alone."""
-    n = len(excess_ns)
-    limit = max(_STEP_SIGMA * 1.4826 * float(np.median(np.abs(excess_ns))), _STEP_NS)
-    usual = np.array(
-        [
-            [
-                np.median(excess_ns[max(k - _BESIDE, 0) : k]) if k else excess_ns[0],
-                np.median(excess_ns[k + 1 : k + 1 + _BESIDE]) if k < n - 1 else excess_ns[-1],
-            ]
-            for k in range(n)
-        ]
-    )
-    # Where the rate itself changes, an interval is like those after it: that is no step.
-    above = excess_ns[:, None] - usual
-    out = (np.abs(above) > limit).all(axis=1) & (above[:, 0] * above[:, 1] > 0)
-    # At either end there is nothing beyond: the one side decides.
-    out[0], out[-1] = abs(above[0, 1]) > limit, abs(above[-1, 0]) > limit
-    jump = np.where(out, above[np.arange(n), np.abs(above).argmin(axis=1)], 0.0)
-    jump[0], jump[-1] = above[0, 1] * out[0], above[-1, 0] * out[-1]
-    steps: list[tuple[int, float]] = []
-    stray = np.zeros(n + 1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], out.astype(np.int8), [0]])))
-    for first, end in edges.reshape(-1, 2).tolist():
-        total = float(jump[first:end].sum())
-        if end - first == 1 and first in (0, n - 1):
-            # The first or the last stamp alone: a step there would be no more than that.
-            stray[0 if first == 0 else n] = -total if first == 0 else total
-        elif abs(total) > limit:
-            steps.append((end - 1, total))
-            stray[first + 1 : end] = np.cumsum(jump[first : end - 1])
-        else:
-            stray[first + 1 : end] = np.cumsum(jump[first : end - 1])
-    return steps, stray
 
 
 def offset_change(
@@ -272,30 +139,8 @@ def check_stamps(
         Without them the rate alone is looked at.
     """
     regularity = stamp_regularity(stamps_ns)
-    problems: list[str] = []
-    sd_ns = np.abs(regularity.stray_ns)
-    period_ms = regularity.period_ns / 1e6
-    if not regularity.is_steady and len(stamps_ns) >= MIN_FRAMES:
-        problems.append(
-            f"frame stamps: the intervals vary from {regularity.shortest_ns / 1e6:.2f} to "
-            f"{regularity.longest_ns / 1e6:.2f} ms (median {period_ms:.2f} ms), so the stamps cannot be "
-            "checked against a steady rate. Fix the camera's frame rate"
-        )
-    if regularity.jitter_ns > JITTER_NS:
-        sd_ns = np.hypot(sd_ns, regularity.jitter_ns)
-        problems.append(
-            f"frame stamps scatter by {regularity.jitter_ns / 1e6:.2g} ms (sd) about a steady period of "
-            f"{period_ms:.3f} ms: they were made late or rounded, or the camera is not free-running. Poses "
-            "are as unsure as the motion in that time"
-        )
-    strays = np.flatnonzero(regularity.stray_ns)
-    if strays.size:
-        worst = int(strays[np.argmax(np.abs(regularity.stray_ns[strays]))])
-        problems.append(
-            f"{strays.size} frame stamp{'' if strays.size == 1 else 's'} off a steady period of "
-            f"{period_ms:.3f} ms, most that of frame {worst} by {regularity.stray_ns[worst] / 1e6:+.2f} ms: "
-            "poses there are as unsure as the motion in that time"
-        )
+    problems = _words_on_rate(regularity)
+    sd_ns = np.hypot(regularity.stray_ns, regularity.jitter_ns if regularity.jitter_ns > JITTER_NS else 0.0)
     is_contradicted, level, levels_ns = False, 0.0, [0.0]
     ends = [0, *(s.frame for s in regularity.steps), len(stamps_ns)]
     for i, step in enumerate(regularity.steps, start=1):
@@ -335,6 +180,33 @@ def check_stamps(
                 f"the motion in the {spread_ns / 1e6:.1f} ms that come together to either end of the run"
             )
     return StampCheck(regularity, np.hypot(sd_ns, spread_ns), tuple(problems), is_contradicted)
+
+
+def _words_on_rate(regularity: StampRegularity) -> list[str]:
+    """Return what the stamps alone say against themselves, steps left out."""
+    problems: list[str] = []
+    period_ms = regularity.period_ns / 1e6
+    if not regularity.is_steady and len(regularity.stray_ns) >= MIN_FRAMES:
+        problems.append(
+            f"frame stamps: the intervals vary from {regularity.shortest_ns / 1e6:.2f} to "
+            f"{regularity.longest_ns / 1e6:.2f} ms (median {period_ms:.2f} ms), so the stamps cannot be "
+            "checked against a steady rate. Fix the camera's frame rate"
+        )
+    if regularity.jitter_ns > JITTER_NS:
+        problems.append(
+            f"frame stamps scatter by {regularity.jitter_ns / 1e6:.2g} ms (sd) about a steady period of "
+            f"{period_ms:.3f} ms: they were made late or rounded, or the camera is not free-running. Poses "
+            "are as unsure as the motion in that time"
+        )
+    strays = np.flatnonzero(regularity.stray_ns)
+    if strays.size:
+        worst = int(strays[np.argmax(np.abs(regularity.stray_ns[strays]))])
+        problems.append(
+            f"{strays.size} frame stamp{'' if strays.size == 1 else 's'} off a steady period of "
+            f"{period_ms:.3f} ms, most that of frame {worst} by {regularity.stray_ns[worst] / 1e6:+.2f} ms: "
+            "poses there are as unsure as the motion in that time"
+        )
+    return problems
 
 
 def _verdict(step: StampStep, change: OffsetChange | None) -> Literal["stamps", "paused", "unknown"]:

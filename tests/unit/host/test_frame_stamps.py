@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from brick_shakes import simulate_shake
 
-from bricktrack_host.fusion.frame_stamps import check_stamps, offset_change, stamp_regularity
+from bricktrack_host.fusion.frame_stamps import check_stamps, offset_change
 from bricktrack_host.fusion.fused_output import unsure_times
+from bricktrack_host.fusion.stamp_regularity import stamp_regularity
 from bricktrack_host.fusion.time_alignment import align_times
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.stages.motion import with_unsure_times
