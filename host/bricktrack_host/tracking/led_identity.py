@@ -289,6 +289,16 @@ class _Run:
         Frames that scatter beyond their neighbours are identified again, from where the others show the LEDs;
         what then does not fit is refused.
         """
+        had = (self.result.blob_of_led >= 0).any(axis=1)
+        self._settle_rounds()
+        n_found = (self.result.blob_of_led >= 0).sum(axis=1)
+        # What is left beside frames that were refused, with no neighbours to judge it by, may be the culprit.
+        beside = maximum_filter((had & (n_found == 0)).astype(np.int64), 5, mode="constant") > 0
+        R, t = self.result.R_camera_brick, self.result.t_camera_brick_mm
+        turn = turn_between(R, poses_between(self._stamps_ns, R, t)[0])
+        self._refuse(np.flatnonzero(beside & (n_found > 0) & (n_found < self._n_leds) & np.isnan(turn)))
+
+    def _settle_rounds(self) -> None:
         for round_ in range(_WARM_ROUNDS + _SETTLE_ROUNDS):
             frames = np.flatnonzero((self.result.blob_of_led >= 0).any(axis=1))
             if frames.size < _NEAR_FRAMES:
@@ -378,6 +388,8 @@ class _Run:
         np.fmin.at(least, row, left)
         few = (self.result.blob_of_led[frames] >= 0).sum(axis=1) <= MIN_INLIERS
         doubtful = few | ~(least > _SAME_TURN * turn[frames]) | np.isinf(least)
+        # In a run that turns smoothly; one that jumps from frame to frame tells nothing by its neighbours.
+        doubtful |= (turn[frames] > _MOST_TURN_RAD) & (limit[frames] < _MOST_TURN_RAD)
         self._refuse(frames[doubtful & worst[frames] & (best < 0)])
         return limit
 
