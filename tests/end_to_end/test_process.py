@@ -226,7 +226,8 @@ def test_a_film_of_the_run_keeps_its_frames_times(processed, bench, tmp_path):
     assert n == 10
     with av.open(str(film)) as container:
         frames = list(container.decode(video=0))
-    assert [(f.width, f.height) for f in frames] == [(480, 270 + 90)] * 10  # the picture; below it words and the motion
+    # The picture; below it words and the motion.
+    assert [(f.width, f.height) for f in frames] == [(480, 270 + 90)] * 10
     stamps = processed.result.observations.sensor_timestamp_ns[30:40]
     expected = (stamps - stamps[0]) / 1e9 * 4.0
     assert [f.time for f in frames] == pytest.approx(expected.tolist(), abs=1e-4)
