@@ -2,7 +2,9 @@
 
 The lights of all pictures are at hand, so the slow parts run on many frames at once: from one identified
 frame the pattern of LEDs is followed, forwards and backwards, in the image alone; then the poses of all those
-frames verify it together. Frames that the poses refute, and the first, are searched from nothing.
+frames verify it together. Frames that the poses refute, and the first, are searched from nothing. At last the
+run's own motion judges every frame (`identity_motion`): what scatters or turns off its course is mended, or
+refused.
 """
 
 from collections.abc import Sequence
@@ -47,10 +49,10 @@ _MAX_COAST_NS = 500_000_000  # after so long without LEDs the last pattern says 
 
 _SUSPECT, _NEAR_FRAMES = 3.0, 9
 _MOVED_PX = 0.5  # residuals beyond this may be a motion's
-_LEAST_GATE_PX = 0.5
-_LEAST_TURN_RAD = 0.01
-_MOST_TURN_RAD = 0.1
-_SAME_TURN = 0.7
+_LEAST_GATE_PX = 0.5  # what calibration and profile may leave, beside centroid noise
+_LEAST_TURN_RAD = 0.01  # off the cubic through its neighbours; a 2 degree shake at 6 Hz is 0.011 off
+_MOST_TURN_RAD = 0.1  # no shaken brick's, where its run is smooth
+_SAME_TURN = 0.7  # share of a turn that is left without any one LED where it is the brick that turned
 _NEAR_TURNS = 31
 _WARM_ROUNDS, _SETTLE_ROUNDS = 2, 3
 
@@ -328,11 +330,36 @@ class _Run:
                 good[bad[fits]] = True
             self._take(frames, assigned, verified, good)
             tight_px = np.interp(np.arange(len(self._blobs)), frames, tight)
+            self._leave_twins(tight_px)
             limit = self._mend_lurches(tight_px)
             self._refuse(frames[~good])
             self._again(tight_px, limit)
             if (self.result.blob_of_led == before).all():
                 return
+
+    def _leave_twins(self, tight_px: FloatArray) -> None:
+        """Take the other pose of frames in a twin: LEDs nearly in one plane have two, which fit alike."""
+        R, t = self.result.R_camera_brick, self.result.t_camera_brick_mm
+        turn = turn_between(R, poses_between(self._stamps_ns, R, t)[0])
+        calm = np.flatnonzero(turn <= 2 * _LEAST_TURN_RAD)
+        frames = np.flatnonzero(turn > _MOST_TURN_RAD / 2)
+        if calm.size == 0 or frames.size == 0:
+            return
+        nearest = calm[np.abs(calm[None] - frames[:, None]).argmin(axis=1)]
+        assigned = self.result.blob_of_led[frames]
+        lights = self._lights.of_leds(frames, assigned)
+        verified = self._verify(
+            lights,
+            (R[nearest], t[nearest]),
+            intruders=False,
+            motion=unknown_motion(lights.uv_px, self._rays),
+            gate_px=np.where(lights.is_whole, tight_px[frames][:, None], self._gate_px),
+        )
+        nearer = turn_between(verified.poses.R_camera_brick, R[nearest]) < 0.5 * turn_between(
+            R[frames], R[nearest]
+        )
+        fits = _is_whole(verified, lights) & (_scatter_px(verified) <= tight_px[frames])
+        self._take(frames, assigned, verified, fits & nearer)
 
     def _mend_lurches(self, tight_px: FloatArray) -> FloatArray:
         """Leave out the one LED without which a frame does not turn away from its neighbours.

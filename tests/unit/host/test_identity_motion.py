@@ -12,6 +12,12 @@ from bricktrack_host.tracking.identity_motion import poses_between, turn_between
 STEP_NS = 33_327_000
 
 
+@pytest.fixture(scope="module")
+def calibrated():
+    camera = TrueCamera.of_seed(1)
+    return camera, camera.calibrated(noise_px=0.05, rng=np.random.default_rng([1, 7]))
+
+
 def swinging(n=12):
     """A cubic in time, which four neighbours know exactly, and a small turn about one axis."""
     s = np.arange(n) * STEP_NS * 1e-9
@@ -38,22 +44,20 @@ def test_short_gaps_are_bridged_and_long_ones_are_not():
     assert np.isnan(poses_between(stamps, R, t)[1][4:8]).all()
 
 
-def test_rows_are_read_one_after_the_other_about_the_middle_one():
-    camera = TrueCamera.of_seed(1)
-    rays = camera.calibrated(noise_px=0.05, rng=np.random.default_rng(1))
+def test_rows_are_read_one_after_the_other_about_the_middle_one(calibrated):
+    camera, rays = calibrated
     mode = camera.mode
     middle = 0.5 * (mode.height - 1)
     motion = unknown_motion(np.array([[[5.0, middle], [5.0, middle + 100], [np.nan, np.nan]]]), rays)
     assert motion.dt_s[0] == pytest.approx([0.0, 100 * mode.line_time_ns * 1e-9, 0.0], abs=1e-12)
 
 
-def test_identities_hold_at_three_tenths_of_a_metre_a_second(monkeypatch):
+def test_identities_hold_at_three_tenths_of_a_metre_a_second(calibrated, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[3] / "scripts"))
     monkeypatch.delitem(sys.modules, "identity_frames", raising=False)
     from identity_frames import fitted_brick, tracked
 
-    camera = TrueCamera.of_seed(1)
-    rays = camera.calibrated(noise_px=0.05, rng=np.random.default_rng([1, 7]))
+    camera, rays = calibrated
     found = tracked(
         450,
         fitted_brick(paper_brick()),
