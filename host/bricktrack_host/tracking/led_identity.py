@@ -291,6 +291,7 @@ class _Run:
         Frames that scatter beyond their neighbours are identified again, from where the others show the LEDs;
         what then does not fit is refused.
         """
+        self._refuse_lone()
         had = (self.result.blob_of_led >= 0).any(axis=1)
         self._settle_rounds()
         n_found = (self.result.blob_of_led >= 0).sum(axis=1)
@@ -299,6 +300,16 @@ class _Run:
         R, t = self.result.R_camera_brick, self.result.t_camera_brick_mm
         turn = turn_between(R, poses_between(self._stamps_ns, R, t)[0])
         self._refuse(np.flatnonzero(beside & (n_found > 0) & (n_found < self._n_leds) & np.isnan(turn)))
+
+    def _refuse_lone(self) -> None:
+        """Refuse frames of four lights, which fit by chance, that no frame beside them bears out."""
+        n_found = (self.result.blob_of_led >= 0).sum(axis=1)
+        known = np.flatnonzero(n_found)
+        R, t = self.result.R_camera_brick, self.result.t_camera_brick_mm
+        turn = turn_between(R, poses_between(self._stamps_ns, R, t)[0])
+        lone = np.isnan(turn[known]) & (n_found[known] <= MIN_INLIERS)
+        lone[:2], lone[-2:] = False, False
+        self._refuse(known[lone])
 
     def _settle_rounds(self) -> None:
         for round_ in range(_WARM_ROUNDS + _SETTLE_ROUNDS):
@@ -371,11 +382,6 @@ class _Run:
         R, t = self.result.R_camera_brick, self.result.t_camera_brick_mm
         between, _ = poses_between(self._stamps_ns, R, t)
         turn = turn_between(R, between)
-        n_found = (self.result.blob_of_led >= 0).sum(axis=1)
-        known = np.flatnonzero(n_found)
-        lone = np.isnan(turn[known]) & (n_found[known] <= MIN_INLIERS)
-        lone[:2], lone[-2:] = False, False
-        self._refuse(known[lone])  # four lights fit by chance, and no frame beside them bears them out
         judged = np.flatnonzero(np.isfinite(turn))
         if judged.size == 0:
             return np.full(len(R), _LEAST_TURN_RAD)
