@@ -250,7 +250,7 @@ def test_runs_are_pulled_and_each_unit_shows_how_far_it_is(page, lab):
 def test_the_last_test_is_told_and_its_reports_open(page, lab):
     page.get_by_role("tab", name="Last test").click()
     expect(page.get_by_text("shake-12 (simulated)")).to_be_visible()
-    expect(page.get_by_text("No problem found: 2 of 2 units on the same samples")).to_be_visible()
+    expect(page.get_by_text("Usable with care: 2 of 2 units on the same samples")).to_be_visible()
     expect(page.locator(".q-table tr", has_text="brick-7").first).to_contain_text("good")
     expect(page.locator(".q-table tr", has_text="b7-2_0001_shake")).to_contain_text("452 of 462")
     screenshot(page, "last-test")

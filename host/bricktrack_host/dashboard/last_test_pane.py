@@ -60,7 +60,7 @@ def _show(last: LastTest, lab: Path) -> None:
     )  # fmt: skip
     _table(
         "Units",
-        {"unit": "unit", "run": "run", "edges": "edges", "poses": "poses", "sd_mm": "deviation, mm",
+        {"unit": "unit", "run": "run", "edges": "edges", "poses": "poses", "sd_mm": "stated sd, mm",
          "verdict": "verdict", "report": "report"},
         unit_rows(last, lab),
     )  # fmt: skip

@@ -101,8 +101,12 @@ def verdict(summary: TestSummary) -> tuple[str, str]:
     said = f"{agree} of {_units(len(summary.units))} on the same samples, {seen} seen from their base"
     if summary.assemblies and not moved:
         return f"Not usable: {said}.", "bad"
-    if summary.problems:
-        return f"Usable with care: {said}; {_count(len(summary.problems), 'point')} to read first.", "care"
+    doubtful = sum(bool(unit.problems) for unit in summary.units)
+    points = [_count(len(summary.problems), "point") + " to read first"] if summary.problems else []
+    if doubtful:
+        points.append(f"{_units(doubtful)} with points of {'its' if doubtful == 1 else 'their'} own")
+    if points:
+        return f"Usable with care: {said}; {', '.join(points)}.", "care"
     return f"No problem found: {said}.", "good"
 
 

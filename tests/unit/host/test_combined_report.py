@@ -104,10 +104,13 @@ def test_spans_are_the_stretches_of_set_samples():
 
 def test_problems_come_first_and_set_the_mood(folder):
     test = read_combined_test(folder)
-    line, mood = verdict(test.summary)
-    assert (line, mood) == (
+    calm = [msgspec.structs.replace(unit, problems=[]) for unit in test.summary.units]
+    assert verdict(msgspec.structs.replace(test.summary, units=calm)) == (
         "No problem found: 2 of 2 units on the same samples, 2 components seen from their base.", "good",
     )  # fmt: skip
+    doubted = [msgspec.structs.replace(calm[0], problems=["video: cut"]), calm[1]]
+    line, mood = verdict(msgspec.structs.replace(test.summary, units=doubted))
+    assert (line.endswith("1 unit with points of its own."), mood) == (True, "care")
     told = msgspec.structs.replace(test.summary, problems=["b7-2: <its> first edge is unknown"])
     text = parsed(render_combined_report(CombinedTest(told, test.motions)))[1]
     assert "1 point to read first" in text
