@@ -23,8 +23,8 @@ setup: $(READY)  ## make the virtual environment .venv, and no more
 demo: $(READY)  ## record a simulated brick with the real daemon, pull it, process it, open the report
 	$(BIN)/bricktrack demo --folder demo
 
-test: $(READY)  ## all tests, two at a time
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+test: $(READY)  ## all tests, two files at a time
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-virtual-camera: $(READY)  ## the picamera2 adapter under the real libraries, on the virtual Pi
 	tests/virtual_pi/run_camera.sh
