@@ -42,6 +42,14 @@ def rename_durably(source: Path, target: Path) -> None:
     sync_folder(target.parent)
 
 
+def replace_durably(path: Path, data: bytes) -> None:
+    """Write a file in place of one of before, whole or not at all; after return it survives a power cut."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.unlink(missing_ok=True)
+    write_durably(partial, data)
+    rename_durably(partial, path)
+
+
 def write_folder_whole(
     folder: Path,
     write: Callable[[Path], object],

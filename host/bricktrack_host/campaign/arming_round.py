@@ -16,7 +16,7 @@ from bricktrack_common.run_manifest import MANIFEST_NAME
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_common.wire_messages import StatusReply
 from bricktrack_host.campaign.test_plan import PlannedTest, is_of_test, newest, unit_of
-from bricktrack_host.durable_files import storage_errors, sync_folder, write_durably
+from bricktrack_host.durable_files import replace_durably, storage_errors
 
 ROUND_NAME = "arming.json"
 
@@ -89,12 +89,9 @@ def save_round(folder: Path, going: ArmingRound) -> None:
     StorageError
         If it cannot be written.
     """
-    path, partial = folder / ROUND_NAME, folder / f".{ROUND_NAME}.partial"
+    path = folder / ROUND_NAME
     with storage_errors(path, "Make room"):
-        partial.unlink(missing_ok=True)
-        write_durably(partial, dump_json(going))
-        partial.replace(path)
-        sync_folder(folder)
+        replace_durably(path, dump_json(going))
 
 
 def close_round(folder: Path, going: ArmingRound) -> None:

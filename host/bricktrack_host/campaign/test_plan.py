@@ -14,7 +14,7 @@ import msgspec
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.run_manifest import RUN_ID_PATTERN
 from bricktrack_common.typed_data import dump_json, load_json
-from bricktrack_host.durable_files import rename_durably, storage_errors, write_durably
+from bricktrack_host.durable_files import replace_durably, storage_errors
 
 PLAN_NAME = "plan.json"
 COMBINED_FOLDER = "combined"
@@ -78,12 +78,9 @@ def save_plan(folder: Path, plan: PlannedTest) -> None:
             f"there is a test {plan.name} already, {_in_words(there)}; this one would be {_in_words(plan)}. "
             "Choose another name"
         )
-    partial = folder / f".{PLAN_NAME}.partial"
     with storage_errors(path, "Make room"):
         folder.mkdir(parents=True, exist_ok=True)
-        partial.unlink(missing_ok=True)
-        write_durably(partial, dump_json(plan))
-        rename_durably(partial, path)
+        replace_durably(path, dump_json(plan))
 
 
 def _in_words(plan: PlannedTest) -> str:

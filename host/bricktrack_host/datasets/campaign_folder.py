@@ -26,6 +26,7 @@ from bricktrack_common.typed_data import convert, dump_json, load_json
 from bricktrack_host.datasets.motion_schema import MOTION_SCHEMA, MOTION_VERSION, require_known_version
 from bricktrack_host.durable_files import (
     rename_durably,
+    replace_durably,
     storage_errors,
     sync_file,
     sync_folder,
@@ -77,9 +78,7 @@ def locked(root: Path) -> Iterator[None]:
             ) from e
         with storage_errors(root, "The dataset cannot be written; make room"):
             if not (root / MARKER_NAME).is_file():
-                partial.unlink(missing_ok=True)
-                write_durably(partial, dump_json(_Marker()))
-                rename_durably(partial, root / MARKER_NAME)
+                replace_durably(root / MARKER_NAME, dump_json(_Marker()))
             require_dataset(root)
             (root / MOTION_FOLDER).mkdir(exist_ok=True)
             _finish(root)

@@ -8,7 +8,7 @@ import numpy as np
 
 from bricktrack_host.datasets.comparison import Alike, worst_first
 from bricktrack_host.datasets.comparison_pairs import Comparison
-from bricktrack_host.durable_files import rename_durably, storage_errors, write_durably
+from bricktrack_host.durable_files import replace_durably, storage_errors
 
 _AXES = ("dx_mm", "dy_mm", "dz_mm", "drot_x_deg", "drot_y_deg", "drot_z_deg")
 
@@ -33,12 +33,9 @@ def write_comparison_csv(comparison: Comparison, path: Path) -> None:
     writer = csv.DictWriter(text, list(rows[0]) if rows else [])
     writer.writeheader()
     writer.writerows(rows)
-    partial = path.with_name(f".{path.name}.partial")
     with storage_errors(path, "Choose another --csv, or make room"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.unlink(missing_ok=True)
-        write_durably(partial, text.getvalue().encode())
-        rename_durably(partial, path)
+        replace_durably(path, text.getvalue().encode())
 
 
 def _row(pair: Alike) -> Row:

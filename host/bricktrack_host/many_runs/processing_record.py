@@ -17,7 +17,7 @@ from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import RunFormatError, StorageError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_common.typed_data import dump_json, load_json
-from bricktrack_host.durable_files import storage_errors, write_durably
+from bricktrack_host.durable_files import replace_durably, storage_errors
 from bricktrack_host.many_runs.software_identity import code_sha256
 
 RECORD_NAME = "processing.json"
@@ -117,11 +117,9 @@ def write_record(folder: Path, record: ProcessingRecord) -> None:
     StorageError
         If it cannot be written.
     """
-    path, partial = folder / RECORD_NAME, folder / f".{RECORD_NAME}.partial"
+    path = folder / RECORD_NAME
     with storage_errors(path, "Make room"):
-        partial.unlink(missing_ok=True)
-        write_durably(partial, dump_json(record))
-        partial.replace(path)
+        replace_durably(path, dump_json(record))
 
 
 def read_record(folder: Path) -> ProcessingRecord | None:
