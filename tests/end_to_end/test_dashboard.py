@@ -3,7 +3,6 @@
 import contextlib
 import os
 import re
-import shutil
 import subprocess
 import sys
 import threading
@@ -13,8 +12,9 @@ import cv2
 import numpy as np
 import pytest
 from fake_unit import FakeUnit
+from headless_chromium import headless_chromium, needs_chromium
 from light_fleet import LightFleet, write_fleet_file
-from playwright.sync_api import Error, expect, sync_playwright
+from playwright.sync_api import expect
 from run_folders import make_run
 from small_lab import BRICK, UNITS, invented_run
 
@@ -25,17 +25,13 @@ from bricktrack_host.transfer.unit_client import UnitClient
 
 pytest.importorskip("nicegui", reason="the control page's libraries are not installed")
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SIZES = {"desktop": (1440, 900), "tablet": (1024, 768), "tablet-upright": (800, 1280)}
 FINGER_PX = 44  # WCAG 2.1, target size
 N_LIGHT = 400
 # Four hundred units, the server and the browser share the machine with other tests.
 expect.set_options(timeout=30_000)
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
+pytestmark = [pytest.mark.slow, needs_chromium]
 
 
 def screenshot(page, name):
@@ -95,12 +91,7 @@ def lab(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(lab):
-    with sync_playwright() as p:
-        as_root = ["--no-sandbox"] if os.geteuid() == 0 else []
-        try:
-            chromium = p.chromium.launch(executable_path=CHROMIUM, args=as_root)
-        except Error as e:
-            pytest.skip(f"{CHROMIUM} does not start: {e.message.splitlines()[0]}")
+    with headless_chromium() as chromium:
         context = chromium.new_context(viewport={"width": 1440, "height": 900}, has_touch=True)
         asked = []
         context.on("request", lambda request: asked.append(request.url))
@@ -113,7 +104,6 @@ def page(lab):
         assert not problems
         # No site but this machine's is asked for anything: the page works offline.
         assert {url.split("/")[2] for url in asked if not url.startswith("data:")} == {lab[0].split("/")[2]}
-        chromium.close()
 
 
 @pytest.fixture(autouse=True)

@@ -9,29 +9,20 @@ import sys
 
 import pytest
 from fake_unit import FakeUnit
-from playwright.sync_api import Error, expect, sync_playwright
+from headless_chromium import headless_chromium, needs_chromium
+from playwright.sync_api import Error, expect
 
 pytest.importorskip("nicegui", reason="the control page's libraries are not installed")
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 PASSWORD = "correct horse battery"
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
+pytestmark = [pytest.mark.slow, needs_chromium]
 
 
 @pytest.fixture(scope="module")
 def browser():
-    with sync_playwright() as p:
-        as_root = ["--no-sandbox"] if os.geteuid() == 0 else []
-        try:
-            chromium = p.chromium.launch(executable_path=CHROMIUM, args=as_root)
-        except Error as e:
-            pytest.skip(f"{CHROMIUM} does not start: {e.message.splitlines()[0]}")
+    with headless_chromium() as chromium:
         yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")

@@ -1,15 +1,13 @@
 """The pages as people open them: in a real Chromium, with the network cut."""
 
-import os
 import re
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from playwright.sync_api import Error, sync_playwright
+from headless_chromium import headless_chromium, needs_chromium
 from small_lab import BRICK, UNITS, example, invented_run
 
 from bricktrack_host.assemblies.combined_test import combine_test
@@ -21,13 +19,8 @@ from bricktrack_host.reporting.interactive_report import write_interactive_repor
 from bricktrack_host.reporting.report import write_report
 from bricktrack_host.results.result_store import write_results
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
 WIDTH = 1300
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
+pytestmark = [pytest.mark.slow, needs_chromium]
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +49,8 @@ def pages(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    with sync_playwright() as p:
-        as_root = ["--no-sandbox"] if os.geteuid() == 0 else []
-        try:
-            chromium = p.chromium.launch(executable_path=CHROMIUM, args=as_root)
-        except Error as e:
-            pytest.skip(f"{CHROMIUM} does not start: {e.message.splitlines()[0]}")
+    with headless_chromium() as chromium:
         yield chromium
-        chromium.close()
 
 
 class Window:

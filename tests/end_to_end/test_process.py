@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from path_traced import SAMPLE, import_motion
 from typer.testing import CliRunner
 
 from bricktrack_common.camera_model import SensorMode
@@ -20,11 +21,8 @@ from bricktrack_host.cli import calibrate
 from bricktrack_host.cli.main import app
 from bricktrack_host.pipeline import ProcessSettings, process_run
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.recordings.import_recording import Recording, import_recording
-from bricktrack_host.recordings.loose_files import read_rig
 from bricktrack_host.viewing.overlay_video import write_overlay
 
-SAMPLE = Path(__file__).resolve().parents[1] / "data" / "path-traced"
 LAYOUT = SAMPLE / "layout.toml"
 HIDDEN_FROM, HIDDEN_TO = 35, 42  # frames in which a bar hides m0 wholly (the sample's README)
 
@@ -33,19 +31,7 @@ HIDDEN_FROM, HIDDEN_TO = 35, 42  # frames in which a bar hides m0 wholly (the sa
 def bench(tmp_path_factory):
     """A folder with the imported run and the calibration."""
     folder = tmp_path_factory.mktemp("bench")
-    import_recording(
-        Recording(
-            video=SAMPLE / "motion.h264",
-            timestamps=SAMPLE / "motion_pts_us.txt",
-            imus={"brick": SAMPLE / "imu_motion.csv"},
-            edges=SAMPLE / "edges_motion.csv",
-            rig=read_rig(SAMPLE / "rig.toml", table="motion"),
-            unit="sample",
-            label="motion",
-            simulated=True,
-        ),
-        folder / "runs",
-    )
+    import_motion(folder / "runs")
     calibrate.fit(
         folder / "calibration.json", "sample", rig=SAMPLE / "rig.toml", target="32x18", images_dir=SAMPLE
     )

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from path_traced import import_motion, import_static
 
 from bricktrack_common.brick_model import load_brick_model
 from bricktrack_host.cli import calibrate
 from bricktrack_host.cli.calibrate_leds import leds
 from bricktrack_host.pipeline import process_run
-from bricktrack_host.recordings.import_recording import Recording, import_recording
-from bricktrack_host.recordings.loose_files import read_rig
 
 SAMPLES = os.environ.get("BRICKTRACK_SAMPLES")
 pytestmark = [
@@ -24,23 +23,8 @@ pytestmark = [
 def processed(tmp_path_factory):
     sample = Path(SAMPLES or "") / "path-traced"
     folder = tmp_path_factory.mktemp("sample")
-    for name, imus, edges in (
-        ("static", {}, None),
-        ("motion", {"brick": sample / "imu_motion.csv"}, sample / "edges_motion.csv"),
-    ):
-        import_recording(
-            Recording(
-                video=sample / f"{name}.h264",
-                timestamps=sample / f"{name}_pts_us.txt",
-                imus=imus,
-                edges=edges,
-                rig=read_rig(sample / "rig.toml", table=name),
-                unit="sample",
-                label=name,
-                simulated=True,
-            ),
-            folder,
-        )
+    import_static(folder, sample)
+    import_motion(folder, sample)
     calibration, layout = folder / "calibration.json", folder / "layout.toml"
     calibrate.fit(calibration, "sample", rig=sample / "rig.toml", target="32x18", images_dir=sample)
     leds(folder / "sample_static", calibration, sample / "layout.toml", layout)

@@ -17,17 +17,15 @@ from pathlib import Path
 import msgspec
 import pytest
 from light_fleet import LightFleet, write_fleet_file
+from path_traced import SAMPLE, import_motion
 
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.calibration.calibration_file import load_calibration, save_calibration
 from bricktrack_host.cli import calibrate
-from bricktrack_host.recordings.import_recording import Recording, import_recording
-from bricktrack_host.recordings.loose_files import read_rig
 
 KILLS = int(os.environ.get("BRICKTRACK_KILLS", "3"))
 SEED = int(os.environ.get("BRICKTRACK_SEED", "12"))
-SAMPLE = Path(__file__).resolve().parents[1] / "data" / "path-traced"
 NAMES = ["b7-1", "b7-2"]
 MAY_DIFFER = ("processing.json", "timings.json", "report.html")
 """How long it took, and the page that quotes it."""
@@ -40,19 +38,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def lab(tmp_path):
     """Two light units, a recording, and a fleet file that names what its processing needs."""
-    import_recording(
-        Recording(
-            video=SAMPLE / "motion.h264",
-            timestamps=SAMPLE / "motion_pts_us.txt",
-            imus={"brick": SAMPLE / "imu_motion.csv"},
-            edges=SAMPLE / "edges_motion.csv",
-            rig=read_rig(SAMPLE / "rig.toml", table="motion"),
-            unit="sample",
-            label="motion",
-            simulated=True,
-        ),
-        tmp_path / "recorded",
-    )
+    import_motion(tmp_path / "recorded")
     calibrate.fit(
         tmp_path / "sample.json", "sample", rig=SAMPLE / "rig.toml", target="32x18", images_dir=SAMPLE,
         model="two-plane", report=False,
