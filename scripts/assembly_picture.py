@@ -7,6 +7,7 @@ import csv
 import sys
 from pathlib import Path
 
+import motion_and_error
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -35,12 +36,7 @@ def main() -> None:
     motion.set_ylabel("x from rest, mm")
     motion.legend(loc="upper right", frameon=False, fontsize=9)
     motion.set_title("motion of the parts of a brick, seen from its base (simulated)", fontsize=10)
-    error.set_ylabel("error, µm")
-    error.set_xlabel("s after the first edge")
-    for axes in (motion, error):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="0.92", lw=0.6)
-    figure.savefig(output, dpi=110)
+    motion_and_error.save(figure, motion, error, output)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ python scripts/readme_picture.py RESULTS_FOLDER TRUTH OUTPUT.png
 import sys
 from pathlib import Path
 
+import motion_and_error
 from matplotlib.figure import Figure
 
 from bricktrack_host.quality import LedFlag
@@ -60,12 +61,7 @@ def main() -> None:
     motion.set_ylabel("from rest, mm")
     motion.set_title("fused at every edge of the square wave; dots: camera alone", fontsize=10)
     motion.legend(loc="lower left", ncols=3, frameon=False, fontsize=9)
-    error.set_ylabel("error, µm")
-    error.set_xlabel("s after the first edge")
-    for axes in (motion, error):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="0.92", lw=0.6)
-    figure.savefig(output, dpi=110)
+    motion_and_error.save(figure, motion, error, output)
 
 
 if __name__ == "__main__":

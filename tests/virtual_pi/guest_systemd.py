@@ -23,6 +23,7 @@ SYSTEMD = Path("/lib/systemd/systemd")
 CONFIG = Path("/etc/bricktrack/bricktrackd.toml")
 DROP_IN = Path("/etc/systemd/system/bricktrackd.service.d/virtual-pi.conf")
 BOARD = Path("/opt/virtual-pi-cpuinfo")
+HIDDEN_FROM_THE_UNIT = ("root", "home", "tmp")  # ProtectHome= and PrivateTmp=
 RUNS = Path("/var/lib/bricktrack/runs")
 WATCHDOG_S = 10  # WatchdogSec= of the unit
 SETTINGS = """
@@ -117,7 +118,7 @@ def manager():
     # What differs from a unit: a Python that may live in a home or in /tmp, and a board that is told by a file.
     shutil.copy("/proc/cpuinfo", BOARD)
     binds = [f"{BOARD}:/proc/cpuinfo"]
-    binds += [p for p in (sys.base_prefix, str(REPOSITORY)) if p.startswith(("/root/", "/home/", "/tmp/"))]
+    binds += [str(p) for p in (Path(sys.base_prefix), REPOSITORY) if p.parts[1] in HIDDEN_FROM_THE_UNIT]
     DROP_IN.parent.mkdir()
     DROP_IN.write_text(f"[Service]\nProtectHome=tmpfs\nBindReadOnlyPaths={' '.join(binds)}\n")
     made = Manager()

@@ -32,6 +32,7 @@ from bricktrack_host.calibration.pixel_polynomials import (
 )
 from bricktrack_host.calibration.ray_families import CentralFamily
 from bricktrack_host.calibration.ray_fit import RayFit, fit_rays, terms_needed
+from bricktrack_host.calibration.ray_projection import pixel_jacobian, project_in_chunks
 from bricktrack_host.calibration.ray_uncertainty import UncertainRays
 from bricktrack_host.calibration.rig_tolerance import RigTolerance
 
@@ -120,12 +121,7 @@ class CentralRays(UncertainRays):
         NaN behind or in the lens, farther outside the picture than `pixel_polynomials.PICTURE_MARGIN`, and
         where the inverse does not converge.
         """
-        points, shape = as_points("points_camera_mm", points_camera_mm, 3)
-        uv = np.empty((len(points), 2))
-        J = np.empty((len(points), 2, 3))
-        for piece in in_chunks(len(points)):
-            uv[piece], J[piece] = self._project(points[piece])
-        return Projection(uv.reshape(*shape, 2), J.reshape(*shape, 2, 3))
+        return project_in_chunks(points_camera_mm, self._project)
 
     def _project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         from_centre = (points - self.centre_mm).T
@@ -146,15 +142,7 @@ class CentralRays(UncertainRays):
 
         st, M = newton_inverse(self._start(target), evaluate)
         slope = self._slopes.values(st) if self.walk_mm else target
-        # (x, y) = reach P; along a ray d(x, y) = P dz; so d st = M^-1 (d(x, y) - P dz) / depth
-        half = self._scaling.half_px
-        J = np.empty((len(points), 2, 3))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            determinant = (M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]) * depth
-            J[:, 0, 0], J[:, 0, 1] = half[0] * M[1, 1] / determinant, -half[0] * M[0, 1] / determinant
-            J[:, 1, 0], J[:, 1, 1] = -half[1] * M[1, 0] / determinant, half[1] * M[0, 0] / determinant
-            J[:, :, 2] = -(J[:, :, 0] * slope[0][:, None] + J[:, :, 1] * slope[1][:, None])
-        return self._scaling.pixels(st), J
+        return self._scaling.pixels(st), pixel_jacobian(self._scaling, M, slope, reach=depth)
 
     def is_covered(self, uv_px: ArrayLike) -> BoolArray:
         """Tell for pixels, shape (..., 2), whether dots of any plane surrounded them."""

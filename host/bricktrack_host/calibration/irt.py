@@ -32,6 +32,7 @@ from bricktrack_host.calibration.pixel_polynomials import (
 )
 from bricktrack_host.calibration.ray_families import TwoPlaneFamily, two_plane_rows
 from bricktrack_host.calibration.ray_fit import RayFit, fit_rays, terms_needed
+from bricktrack_host.calibration.ray_projection import pixel_jacobian, project_in_chunks
 from bricktrack_host.calibration.ray_uncertainty import UncertainRays
 from bricktrack_host.calibration.rig_tolerance import RigTolerance
 
@@ -127,12 +128,7 @@ class TwoPlaneIrt(UncertainRays):
         NaN behind or in the lens, farther outside the picture than `pixel_polynomials.PICTURE_MARGIN`, and
         where the inverse does not converge.
         """
-        points, shape = as_points("points_camera_mm", points_camera_mm, 3)
-        uv = np.empty((len(points), 2))
-        J = np.empty((len(points), 2, 3))
-        for piece in in_chunks(len(points)):
-            uv[piece], J[piece] = self._project(points[piece])
-        return Projection(uv.reshape(*shape, 2), J.reshape(*shape, 2, 3))
+        return project_in_chunks(points_camera_mm, self._project)
 
     def _project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         x, y, z = points.T
@@ -148,16 +144,8 @@ class TwoPlaneIrt(UncertainRays):
             return along[0] - target[:, which], np.swapaxes(along[1:], 0, 1)
 
         st, M = newton_inverse(self._start((target - centre[:2, None]) / before), evaluate)
-        # d st = M^-1 (d(x, y) - slope dz)
         slope = self._both.values(st)[2:]
-        half = self._scaling.half_px
-        J = np.empty((len(points), 2, 3))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            determinant = M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]
-            J[:, 0, 0], J[:, 0, 1] = half[0] * M[1, 1] / determinant, -half[0] * M[0, 1] / determinant
-            J[:, 1, 0], J[:, 1, 1] = -half[1] * M[1, 0] / determinant, half[1] * M[0, 0] / determinant
-            J[:, :, 2] = -(J[:, :, 0] * slope[0][:, None] + J[:, :, 1] * slope[1][:, None])
-        return self._scaling.pixels(st), J
+        return self._scaling.pixels(st), pixel_jacobian(self._scaling, M, slope)
 
     def is_covered(self, uv_px: ArrayLike) -> BoolArray:
         """Tell for pixels, shape (..., 2), whether dots surrounded them at both planes."""

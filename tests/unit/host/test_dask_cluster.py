@@ -6,6 +6,7 @@ from contextlib import closing
 from functools import partial
 
 import pytest
+from heard_progress import Heard
 from run_works import dies, dies_once, work
 
 from bricktrack_common.errors import ConfigError
@@ -21,18 +22,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
-
-
-class Heard:
-    def __init__(self):
-        self.stages = []
-        self.done = []
-
-    def stage(self, name, total):
-        self.stages.append((name, total))
-
-    def advance_to(self, done):
-        self.done.append(done)
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import run_works
+from heard_progress import Heard
 from run_works import dies_once, half_written, together, work
 
 from bricktrack_common.errors import ConfigError
@@ -25,18 +26,6 @@ def as_it_came(index, value):
 
 def process_side_by_side(works, *, workers=2, progress, finish=as_it_came):
     return do_all(len(works), lambda i: works[i], LocalProcesses(workers), progress=progress, finish=finish)
-
-
-class Heard:
-    def __init__(self):
-        self.stages = []
-        self.done = []
-
-    def stage(self, name, total):
-        self.stages.append((name, total))
-
-    def advance_to(self, done):
-        self.done.append(done)
 
 
 def run_all(works, workers=2):
