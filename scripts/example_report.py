@@ -23,6 +23,7 @@ from bricktrack_common.run_manifest import (
     RunManifest,
     TriggerSection,
 )
+from bricktrack_host.evaluation.paper_brick import paper_brick
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.reporting.plots import CalibrationPicture, FrameOverlay
 from bricktrack_host.reporting.report import ReportExtras, write_report
@@ -33,18 +34,7 @@ from bricktrack_host.results.true_motion import TrueMotion
 from bricktrack_host.results.truth import compare_with_truth
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
-LED_NAMES = ("m0", "m1", "m2", "m3", "m4", "m5", "m6")
-LEDS_MM = np.array(
-    [
-        [0.0, 0.0, 0.0],
-        [24.607, 3.5, 12.584],
-        [51.62, 12.5, 0.0],
-        [0.0, 14.5, 0.0],
-        [0.0, 25.0, 0.0],
-        [0.0, 46.5, 0.0],
-        [54.514, 49.0, 0.0],
-    ]
-)
+BRICK = paper_brick()
 T0_NS = 5_118_514_105_508
 PERIOD_NS = 33_326_871
 DURATION_S = 15.0
@@ -170,7 +160,7 @@ def example_result(seed: int = 1) -> RunResult:
     """Return the result of an invented run: seeded, simulated, with one impact and one dropout."""
     rng = np.random.default_rng(seed)
     manifest = example_manifest()
-    n_leds = len(LED_NAMES)
+    n_leds = BRICK.n_leds
     stamps = T0_NS - 480_000_000 + np.arange(464, dtype=np.int64) * PERIOD_NS
     stamps = np.delete(stamps, [121, 122])
     n = len(stamps)
@@ -179,7 +169,7 @@ def example_result(seed: int = 1) -> RunResult:
     part = np.abs(t_ns - T0_NS - DROPOUT_S[0] * 1e9) < 8e7
 
     R, t_mm, _, _ = true_motion_at(t_ns)
-    p = np.einsum("nij,lj->nli", R, LEDS_MM) + t_mm[:, None]
+    p = np.einsum("nij,lj->nli", R, BRICK.led_positions_mm) + t_mm[:, None]
     uv = np.array([959.5, 539.5]) + 2714.0 * p[..., :2] / p[..., 2:]
     residual = rng.normal(0, 0.06, (n, n_leds, 2))
     led_flags = np.zeros((n, n_leds), dtype=np.int64)
@@ -262,7 +252,7 @@ def example_result(seed: int = 1) -> RunResult:
     numbers = np.arange(edge_fit.last_index + 1, dtype=np.int64)
     return RunResult(
         manifest=manifest,
-        led_names=LED_NAMES,
+        led_names=BRICK.led_names,
         observations=observations,
         optical=optical,
         fused={

@@ -8,6 +8,7 @@ from types import ModuleType
 import msgspec
 
 from bricktrack_common.run_manifest import MANIFEST_NAME, write_manifest
+from bricktrack_host.assemblies.combined_test import combine_test
 from bricktrack_host.results.result_store import RunResult, write_results
 from bricktrack_host.transfer.assembly_config import AssemblyConfig, Component, View
 
@@ -84,3 +85,11 @@ def invented_run(folder: Path, unit: str) -> RunResult:
     write_manifest(folder / MANIFEST_NAME, manifest)
     write_results(result, folder / "results")
     return result
+
+
+def invented_lab(folder: Path) -> None:
+    """Write an invented run of every unit to a folder, and the test ``shake-12`` that combines them."""
+    for unit in UNITS:
+        invented_run(folder / unit, unit)
+    results = {unit: folder / unit / "results" for unit in UNITS}
+    combine_test("shake-12", results, [BRICK], folder / "shake-12")

@@ -1,7 +1,5 @@
 """Text files of recordings made by other means: stamps of pictures, inertial samples, edges, the rig."""
 
-import csv
-import re
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -12,8 +10,9 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.camera_model import IMX219_1080P, SensorMode
-from bricktrack_common.errors import ConfigError, RunFormatError, VideoError
+from bricktrack_common.errors import ConfigError, VideoError
 from bricktrack_common.typed_data import convert, load_toml
+from bricktrack_host.recordings.timed_csv import TimedCsv, read_text
 
 TimestampUnit = Literal["auto", "us", "ms"]
 _MAX_FRAME_RATE_HZ = 1000.0
@@ -56,7 +55,7 @@ def read_timestamps(path: Path, *, unit: TimestampUnit = "auto") -> IntArray:
     VideoError
         If a line is no number, stamps do not increase, or the unit cannot be as read.
     """
-    lines = [(n, text.strip()) for n, text in enumerate(_read_text(path, VideoError).splitlines(), start=1)]
+    lines = [(n, text.strip()) for n, text in enumerate(read_text(path, VideoError).splitlines(), start=1)]
     is_timecode = any(text.lower().startswith("# timecode format v2") for _, text in lines[:3])
     rows = [(n, text) for n, text in lines if text and not text.startswith("#")]
     if not rows:
@@ -105,18 +104,12 @@ def read_imu_csv(path: Path) -> LooseImu:
     RunFormatError
         If a column is missing, a field is no number, or times do not increase.
     """
-    header, rows = read_csv_rows(path)
-    gyro_unit = next((u for u, names in _GYRO_COLUMNS.items() if set(names) <= set(header)), None)
-    wanted = ["t_ns", *_ACC_COLUMNS, *_GYRO_COLUMNS[gyro_unit or "dps"]]
-    missing = [c for c in wanted if c not in header]
-    if missing:
-        raise RunFormatError(
-            f"{path}: no column {', '.join(missing)}; the first line must name t_ns, ax_mps2, ay_mps2, "
-            f"az_mps2, gx_dps, gy_dps and gz_dps (or g?_radps), and names {', '.join(header)}"
-        )
-    columns = [header.index(c) for c in wanted]
-    t_ns = read_times_ns(path, [(n, row[columns[0]]) for n, row in rows])
-    values = np.array([[read_number(path, n, row[c]) for c in columns[1:]] for n, row in rows])
+    table = TimedCsv.read(path)
+    gyro_unit = next((u for u, names in _GYRO_COLUMNS.items() if set(names) <= set(table.header)), "dps")
+    t_ns, values = table.columns(
+        (*_ACC_COLUMNS, *_GYRO_COLUMNS[gyro_unit]),
+        expected="t_ns, ax_mps2, ay_mps2, az_mps2, gx_dps, gy_dps and gz_dps (or g?_radps)",
+    )
     values[~np.isfinite(values).all(axis=1)] = np.nan
     gyro = np.rad2deg(values[:, 3:]) if gyro_unit == "radps" else values[:, 3:]
     return LooseImu(t_ns, values[:, :3], gyro)
@@ -124,64 +117,7 @@ def read_imu_csv(path: Path) -> LooseImu:
 
 def read_edges_csv(path: Path) -> IntArray:
     """Return the rising edges in the column ``t_ns`` of a CSV file, int64 ns, strictly increasing."""
-    header, rows = read_csv_rows(path)
-    if "t_ns" not in header:
-        raise RunFormatError(f"{path}: no column t_ns; the first line names {', '.join(header)}")
-    column = header.index("t_ns")
-    return read_times_ns(path, [(n, row[column]) for n, row in rows])
-
-
-def read_csv_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the column names and, with their line numbers, the rows; empty lines and comments left out."""
-    reader = csv.reader(_read_text(path, RunFormatError).splitlines())
-    header: list[str] = []
-    rows: list[tuple[int, list[str]]] = []
-    for row in reader:
-        if not row or row[0].lstrip().startswith("#"):
-            continue
-        if not header:
-            header = [c.strip() for c in row]
-            continue
-        if len(row) != len(header):
-            raise RunFormatError(
-                f"{path}: line {reader.line_num}: {len(row)} fields; the first line names {len(header)}"
-            )
-        rows.append((reader.line_num, row))
-    if not rows:
-        raise RunFormatError(f"{path}: no rows below a first line of column names")
-    return header, rows
-
-
-def read_times_ns(path: Path, fields: list[tuple[int, str]]) -> IntArray:
-    """Return whole nanoseconds from (line number, text), which must increase."""
-    t_ns = np.empty(len(fields), dtype=np.int64)
-    for i, (n, text) in enumerate(fields):
-        # Never by float: ns since boot need more than the 53 bits of one.
-        if not re.fullmatch(r"\s*-?\d{1,18}\s*", text):
-            raise RunFormatError(f"{path}: line {n}: t_ns is {text[:40]!r}; expected whole nanoseconds")
-        t_ns[i] = int(text)
-        if i and t_ns[i] <= t_ns[i - 1]:
-            raise RunFormatError(f"{path}: line {n}: t_ns {text.strip()} does not come after the one before")
-    return t_ns
-
-
-def read_number(path: Path, line: int, text: str) -> float:
-    """Return a number, NaN where the field is empty."""
-    if not text.strip():
-        return float("nan")
-    try:
-        return float(text)
-    except ValueError as e:
-        raise RunFormatError(f"{path}: line {line}: {text[:40]!r} is no number") from e
-
-
-def _read_text(path: Path, error: type[VideoError] | type[RunFormatError]) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as e:
-        raise error(f"{path}: {e.strerror or e}") from e
-    except UnicodeDecodeError as e:
-        raise error(f"{path}: not UTF-8 text ({e.reason} at byte {e.start})") from e
+    return TimedCsv.read(path).columns((), expected="t_ns")[0]
 
 
 class _Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -7,7 +7,7 @@ import numpy as np
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.rotations import matrix_from_quaternion
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.recordings.loose_files import read_csv_rows, read_number, read_times_ns
+from bricktrack_host.recordings.timed_csv import TimedCsv
 from bricktrack_host.tracks import OpticalTrack
 
 _ATTITUDE = ("q_w", "q_x", "q_y", "q_z")
@@ -32,24 +32,17 @@ def read_poses_csv(path: Path, *, sd_deg: float, sd_mm: float) -> OpticalTrack:
         If a column is missing, a field is no number, a quaternion is not of unit length, or times do not
         increase.
     """
-    header, rows = read_csv_rows(path)
-    wanted = ("t_ns", *_ATTITUDE, *_POSITION)
-    missing = [name for name in wanted if name not in header]
-    if missing:
-        raise RunFormatError(
-            f"{path}: no column {', '.join(missing)}; the first line must name {', '.join(wanted)}, "
-            f"and names {', '.join(header)}"
-        )
-    at = [header.index(name) for name in wanted]
-    t_ns = read_times_ns(path, [(n, row[at[0]]) for n, row in rows])
-    values = np.array([[read_number(path, n, row[c]) for c in at[1:]] for n, row in rows])
+    table = TimedCsv.read(path)
+    names = (*_ATTITUDE, *_POSITION)
+    t_ns, values = table.columns(names, expected=", ".join(("t_ns", *names)))
     seen = np.isfinite(values).all(axis=1)
     length = np.linalg.norm(values[:, :4], axis=1)
     bad = seen & (np.abs(length - 1) > _UNIT_WITHIN)
     if bad.any():
         i = int(np.argmax(bad))
+        line = table.rows[i][0]
         raise RunFormatError(
-            f"{path}: line {rows[i][0]}: the quaternion has length {length[i]:.4f}; expected 1 (w, x, y, z)"
+            f"{path}: line {line}: the quaternion has length {length[i]:.4f}; expected 1 (w, x, y, z)"
         )
     n = len(t_ns)
     R, t_mm = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)

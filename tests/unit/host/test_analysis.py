@@ -5,20 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from small_lab import BRICK, UNITS, example, invented_run
+from small_lab import example, invented_lab
 
 from bricktrack_common.errors import RunFormatError
 from bricktrack_host import analysis
-from bricktrack_host.assemblies.combined_test import combine_test
 from bricktrack_host.results.spectra import SpectrumError, amplitude_spectrum
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     lab = tmp_path_factory.mktemp("lab")
-    for unit in UNITS:
-        invented_run(lab / unit, unit)
-    combine_test("shake-12", {unit: lab / unit / "results" for unit in UNITS}, [BRICK], lab / "shake-12")
+    invented_lab(lab)
     return lab
 
 

@@ -9,11 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_lab import BRICK, UNITS, example, invented_run
+from small_lab import example, invented_lab
 from typer.testing import CliRunner
 
 from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.assemblies.combined_test import combine_test
 from bricktrack_host.cli.main import app
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting.combined_interactive import render_interactive_test
@@ -28,9 +27,7 @@ from .test_report import changed
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     lab = tmp_path_factory.mktemp("lab")
-    for unit in UNITS:
-        invented_run(lab / unit, unit)
-    combine_test("shake-12", {unit: lab / unit / "results" for unit in UNITS}, [BRICK], lab / "shake-12")
+    invented_lab(lab)
     return lab
 
 

@@ -57,7 +57,7 @@ def lab(tmp_path_factory):
 @pytest.fixture(scope="module")
 def belongings():
     brick = BrickModel(
-        name="", led_names=example.LED_NAMES, led_positions_mm=example.LEDS_MM,
+        name="", led_names=example.BRICK.led_names, led_positions_mm=example.BRICK.led_positions_mm,
         led_axes=np.tile([0.0, 0.0, -1.0], (7, 1)), led_radii_mm=np.full(7, 3.0),
         imu_lever_arm_mm=None, R_brick_imu=None, led_profile=None,
     )  # fmt: skip
@@ -126,7 +126,7 @@ def test_leds_are_drawn_where_they_were_seen_and_residuals_end_there(lab, saved)
     assert [len(p) for p in points] == used.sum(axis=1).tolist()
     seen = np.isfinite(result.observations.uv_px).all(axis=2)
     _, labels = saved.column("world/camera/leds/names", "Points2D:labels")
-    assert [list(row) for row in labels[300:302]] == [list(example.LED_NAMES)] * 2
+    assert [list(row) for row in labels[300:302]] == [list(example.BRICK.led_names)] * 2
     assert [len(row) for row in labels] == seen.sum(axis=1).tolist()
 
 
@@ -135,14 +135,14 @@ def test_the_brick_stands_where_the_pose_puts_it_and_nowhere_without_one(lab, sa
     t_ns, leds = saved.column("world/optical/leds", "Points3D:positions")
     np.testing.assert_array_equal(t_ns, result.optical.t_ns - result.t0_ns)
     R, t_mm = result.optical.R_camera_brick[77], result.optical.t_camera_brick_mm[77]
-    np.testing.assert_allclose(leds[77], example.LEDS_MM @ R.T + t_mm, atol=2e-5)
+    np.testing.assert_allclose(leds[77], example.BRICK.led_positions_mm @ R.T + t_mm, atol=2e-5)
     known = np.isfinite(result.optical.t_camera_brick_mm).all(axis=1)
     assert not known.all()
     _, boxes = saved.column("world/optical/box", "LineStrips3D:strips")
     assert [len(box) for box in boxes] == known.astype(int).tolist()
     corners = (boxes[77][0] - t_mm) @ R
-    np.testing.assert_allclose(corners.min(axis=0), example.LEDS_MM.min(axis=0) - 6, atol=1e-4)
-    np.testing.assert_allclose(corners.max(axis=0), example.LEDS_MM.max(axis=0) + 6, atol=1e-4)
+    np.testing.assert_allclose(corners.min(axis=0), example.BRICK.led_positions_mm.min(axis=0) - 6, atol=1e-4)
+    np.testing.assert_allclose(corners.max(axis=0), example.BRICK.led_positions_mm.max(axis=0) + 6, atol=1e-4)
     # Twelve edges, each along one axis: fifteen steps of one line, three of them twice.
     steps = np.abs(np.diff(corners, axis=0)) > 1e-3
     assert steps.sum(axis=1).tolist() == [1] * 15
@@ -163,7 +163,10 @@ def test_rays_run_from_the_camera_through_the_centroids_to_the_leds_depth(lab, s
     np.testing.assert_allclose(rays[77][:, 0], 0.0, atol=1e-5)
     seen = ends[:, :2] / ends[:, 2:] * FOCAL_PX + CENTRE_PX
     np.testing.assert_allclose(seen, result.observations.uv_px[77, used], atol=1e-3)
-    placed = example.LEDS_MM @ result.optical.R_camera_brick[77].T + result.optical.t_camera_brick_mm[77]
+    placed = (
+        example.BRICK.led_positions_mm @ result.optical.R_camera_brick[77].T
+        + result.optical.t_camera_brick_mm[77]
+    )
     np.testing.assert_allclose(ends[:, 2], placed[used, 2], atol=1e-4)
 
 
