@@ -15,7 +15,8 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
-from bricktrack_host.tracking.identity_search import N_KEPT, Candidates, Lights, Pattern, propose
+from bricktrack_host.tracking.identity_candidates import N_KEPT, Candidates, Pattern
+from bricktrack_host.tracking.identity_search import Lights, propose
 from bricktrack_host.tracking.p3p import ray_centre_mm
 from bricktrack_host.tracking.segment import Blobs
 from bricktrack_host.tracking.verification import (

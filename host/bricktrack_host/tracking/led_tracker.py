@@ -20,9 +20,10 @@ from bricktrack_common.camera_model import RayModel, SensorMode
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.led_identity import Identities, SegmentMethod, identify_run
+from bricktrack_host.tracking.led_identity import SegmentMethod, identify_run
 from bricktrack_host.tracking.led_profile import LedPrediction, collar_of, predict_brick
 from bricktrack_host.tracking.look_ahead import look_ahead
+from bricktrack_host.tracking.run_identities import Identities
 from bricktrack_host.tracking.segment import Blobs, PaperLimits, Picture, find_blobs, paper_filter
 from bricktrack_host.tracking.verification import MIN_INLIERS
 from bricktrack_host.tracks import LedObservations

@@ -39,7 +39,7 @@ def assign_predicted(
     out = np.full(len(predicted_px), -1, dtype=np.int64)
     blobs = np.ascontiguousarray(blobs_px, dtype=np.float64)
     predicted = np.ascontiguousarray(predicted_px, dtype=np.float64)
-    _assign(blobs, 0, len(blobs), predicted, gate_px, shift_limit_px, out, np.empty((len(out), len(blobs))))
+    _assign(blobs, predicted, gate_px, shift_limit_px, out, np.empty((len(out), len(blobs))))
     return out
 
 
@@ -125,9 +125,10 @@ def _follow(
             for k in range(n_leds):
                 predicted[k, 0], predicted[k, 1] = pattern[k, 0] + drift[0], pattern[k, 1] + drift[1]
             gate = max(0.45 * _closest(pattern, 10 * radius), 0.7 * radius)
-            n = _assign(uv, begin, end, predicted, gate, 10 * radius, assigned, room)
+            lights = uv[begin:end]
+            n = _assign(lights, predicted, gate, 10 * radius, assigned, room)
             if n >= 3:
-                _carry(uv, begin, assigned, pattern, drift)
+                _carry(lights, assigned, pattern, drift)
                 last_ns = stamps_ns[i]
                 if n >= 4:
                     for k in range(n_leds):
@@ -148,7 +149,7 @@ def _closest(pattern: FloatArray, limit: float) -> float:
 
 
 @compiled
-def _carry(uv: FloatArray, begin: int, assigned: IntArray, pattern: FloatArray, drift: FloatArray) -> None:
+def _carry(lights: FloatArray, assigned: IntArray, pattern: FloatArray, drift: FloatArray) -> None:
     """Move the pattern onto its lights, LEDs without one by the shift, turn and scale of the others.
 
     The best similarity in the sense of least squares, in complex numbers; ``drift`` becomes the median shift.
@@ -156,15 +157,15 @@ def _carry(uv: FloatArray, begin: int, assigned: IntArray, pattern: FloatArray, 
     n, sx, sy, tx, ty = 0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(pattern)):
         if assigned[k] >= 0:
-            at = begin + assigned[k]
+            at = assigned[k]
             n += 1
-            sx, sy, tx, ty = sx + pattern[k, 0], sy + pattern[k, 1], tx + uv[at, 0], ty + uv[at, 1]
+            sx, sy, tx, ty = sx + pattern[k, 0], sy + pattern[k, 1], tx + lights[at, 0], ty + lights[at, 1]
     sx, sy, tx, ty = sx / n, sy / n, tx / n, ty / n
     re, im, size = 0.0, 0.0, 1e-9
     for k in range(len(pattern)):
         if assigned[k] >= 0:
-            at = begin + assigned[k]
-            ax, ay, bx, by = pattern[k, 0] - sx, pattern[k, 1] - sy, uv[at, 0] - tx, uv[at, 1] - ty
+            at = assigned[k]
+            ax, ay, bx, by = pattern[k, 0] - sx, pattern[k, 1] - sy, lights[at, 0] - tx, lights[at, 1] - ty
             re, im, size = re + ax * bx + ay * by, im + ax * by - ay * bx, size + ax * ax + ay * ay
     re, im = re / size, im / size
     du, dv = np.empty(n), np.empty(n)
@@ -172,10 +173,10 @@ def _carry(uv: FloatArray, begin: int, assigned: IntArray, pattern: FloatArray, 
     for k in range(len(pattern)):
         x, y = pattern[k, 0] - sx, pattern[k, 1] - sy
         if assigned[k] >= 0:
-            at = begin + assigned[k]
-            du[n], dv[n] = uv[at, 0] - pattern[k, 0], uv[at, 1] - pattern[k, 1]
+            at = assigned[k]
+            du[n], dv[n] = lights[at, 0] - pattern[k, 0], lights[at, 1] - pattern[k, 1]
             n += 1
-            pattern[k, 0], pattern[k, 1] = uv[at, 0], uv[at, 1]
+            pattern[k, 0], pattern[k, 1] = lights[at, 0], lights[at, 1]
         else:
             pattern[k, 0], pattern[k, 1] = tx + re * x - im * y, ty + im * x + re * y
     drift[0], drift[1] = _median(du), _median(dv)
@@ -196,42 +197,37 @@ def _median(values: FloatArray) -> float:
 
 @compiled
 def _assign(
-    uv: FloatArray,
-    begin: int,
-    end: int,
+    lights: FloatArray,
     predicted: FloatArray,
     gate: float,
     shift_limit: float,
     out: IntArray,
     room: FloatArray,
 ) -> int:
-    """Put the light of each LED, numbered from ``begin``, into ``out``, and return how many have one."""
+    """Put the light of each LED into ``out``, and return how many have one."""
     n_leds = len(predicted)
     shift_u, shift_v, lowest = 0.0, 0.0, np.inf
     for k in range(n_leds):
         out[k] = -1
-        for at in range(begin, end):
-            u, v = uv[at, 0] - predicted[k, 0], uv[at, 1] - predicted[k, 1]
+        for at in range(len(lights)):
+            u, v = lights[at, 0] - predicted[k, 0], lights[at, 1] - predicted[k, 1]
             size = math.hypot(u, v)
             if size <= shift_limit:
                 # A large displacement is believed only if it explains more: one gate's worth for each limit.
-                cost = _cost(uv, begin, end, predicted, u, v, gate, gate * size / shift_limit, lowest)
+                cost = _cost(lights, predicted, u, v, gate, gate * size / shift_limit, lowest)
                 if cost < lowest:
                     shift_u, shift_v, lowest = u, v, cost
     if not lowest < np.inf:
         return 0
     n = 0
     for _ in range(2):
-        n = _match(uv, begin, end, predicted, shift_u, shift_v, gate, out, room)
+        n = _match(lights, predicted, shift_u, shift_v, gate, out, room)
         if n == 0:
             break
         du, dv, m = np.empty(n), np.empty(n), 0
         for k in range(n_leds):
             if out[k] >= 0:
-                du[m], dv[m] = (
-                    uv[begin + out[k], 0] - predicted[k, 0],
-                    uv[begin + out[k], 1] - predicted[k, 1],
-                )
+                du[m], dv[m] = lights[out[k], 0] - predicted[k, 0], lights[out[k], 1] - predicted[k, 1]
                 m += 1
         shift_u, shift_v = _median(du), _median(dv)
     return n
@@ -239,15 +235,7 @@ def _assign(
 
 @compiled
 def _cost(
-    uv: FloatArray,
-    begin: int,
-    end: int,
-    predicted: FloatArray,
-    u: float,
-    v: float,
-    gate: float,
-    cost: float,
-    limit: float,
+    lights: FloatArray, predicted: FloatArray, u: float, v: float, gate: float, cost: float, limit: float
 ) -> float:
     """Return ``cost`` and the LEDs' distances from their nearest lights, each at most the gate, or infinity.
 
@@ -257,8 +245,8 @@ def _cost(
         if math.isnan(predicted[k, 0]):
             continue
         nearest = gate * gate
-        for at in range(begin, end):
-            d2 = (uv[at, 0] - predicted[k, 0] - u) ** 2 + (uv[at, 1] - predicted[k, 1] - v) ** 2
+        for at in range(len(lights)):
+            d2 = (lights[at, 0] - predicted[k, 0] - u) ** 2 + (lights[at, 1] - predicted[k, 1] - v) ** 2
             nearest = min(nearest, d2)
         cost += math.sqrt(nearest)
         if cost >= limit:
@@ -268,9 +256,7 @@ def _cost(
 
 @compiled
 def _match(
-    uv: FloatArray,
-    begin: int,
-    end: int,
+    lights: FloatArray,
     predicted: FloatArray,
     u: float,
     v: float,
@@ -279,7 +265,7 @@ def _match(
     room: FloatArray,
 ) -> int:
     """Assign lights to LEDs at the least sum of distances, each at most twice the gate; none beyond it."""
-    n_leds, n_lights = len(predicted), end - begin
+    n_leds, n_lights = len(predicted), len(lights)
     clash = False
     for k in range(n_leds):
         out[k] = -1
@@ -288,8 +274,7 @@ def _match(
         for j in range(n_lights):
             d = 2 * gate
             if known:
-                at = begin + j
-                d = min(d, math.hypot(uv[at, 0] - predicted[k, 0] - u, uv[at, 1] - predicted[k, 1] - v))
+                d = min(d, math.hypot(lights[j, 0] - predicted[k, 0] - u, lights[j, 1] - predicted[k, 1] - v))
             room[k, j] = d
             if d < nearest:
                 nearest, out[k] = d, j
