@@ -23,10 +23,10 @@ from board_pictures import BoardPose, Faults, camera_of, picture_of_board, wrong
 
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_grid import GridOrigin
-from bricktrack_host.calibration.plane_pictures import place_dots, read_grey
-from bricktrack_host.calibration.printed_target import DotTarget
-from bricktrack_host.calibration.ray_calibration import calibrate_rays
+from bricktrack_host.calibration.dots.dot_grid import GridOrigin
+from bricktrack_host.calibration.dots.plane_pictures import place_dots, read_grey
+from bricktrack_host.calibration.rays.ray_calibration import calibrate_rays
+from bricktrack_host.calibration.target.printed_target import DotTarget
 
 DEPTH_MM = {"A": 101.117, "B": 161.111}
 N_BOARDS = 100

@@ -34,12 +34,12 @@ from lens_boards import (  # noqa: E402 (the tests' support is no package)
 )
 
 from bricktrack_common.camera_model import IMX219_1080P  # noqa: E402
-from bricktrack_host.calibration.central_rays import fit_central_rays  # noqa: E402
-from bricktrack_host.calibration.dot_detection import detect_dots  # noqa: E402
-from bricktrack_host.calibration.dot_grid import GridOrigin, assign_grid  # noqa: E402
-from bricktrack_host.calibration.irt import fit_two_plane_irt  # noqa: E402
-from bricktrack_host.calibration.plane_pictures import read_grey  # noqa: E402
-from bricktrack_host.calibration.ray_calibration import calibrate_rays  # noqa: E402
+from bricktrack_host.calibration.dots.dot_detection import detect_dots  # noqa: E402
+from bricktrack_host.calibration.dots.dot_grid import GridOrigin, assign_grid  # noqa: E402
+from bricktrack_host.calibration.dots.plane_pictures import read_grey  # noqa: E402
+from bricktrack_host.calibration.rays.central_rays import fit_central_rays  # noqa: E402
+from bricktrack_host.calibration.rays.irt import fit_two_plane_irt  # noqa: E402
+from bricktrack_host.calibration.rays.ray_calibration import calibrate_rays  # noqa: E402
 
 MODE = IMX219_1080P
 INSIDE_95 = 5.991

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from bricktrack_host.calibration.calibration_file import load_calibration
 from bricktrack_host.calibration.capture_file import load_capture
-from bricktrack_host.calibration.printed_target import DotTarget, target_toml
+from bricktrack_host.calibration.target.printed_target import DotTarget, target_toml
 from bricktrack_host.cli import app
 
 pytestmark = pytest.mark.slow  # some 20 s together, drawing included

@@ -12,7 +12,7 @@ from pinhole import PinholeCamera
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.calibration.printed_target import DotTarget
+from bricktrack_host.calibration.target.printed_target import DotTarget
 
 DARK, LIGHT, DESK = 0.08, 0.72, 0.2  # of full scale
 _KNOT_PX = 8

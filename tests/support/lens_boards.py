@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.calibration.dot_observations import DotObservations
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
 
 A_MM, B_MM = 101.117, 161.111
 WIDTH, HEIGHT = 1920, 1080

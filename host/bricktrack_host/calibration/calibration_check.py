@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.disc_bias import disc_bias_px
-from bricktrack_host.calibration.dot_observations import DotObservations
+from bricktrack_host.calibration.dots.disc_bias import disc_bias_px
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
 
 MIN_DOTS = 20
 OUTLIER_SIGMAS = 6.0

@@ -7,8 +7,8 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.calibration.calibration_file import Calibration, require_match
-from bricktrack_host.calibration.pixel_polynomials import picture_grid
-from bricktrack_host.calibration.ray_uncertainty import CHI_95
+from bricktrack_host.calibration.rays.pixel_polynomials import picture_grid
+from bricktrack_host.calibration.rays.ray_uncertainty import CHI_95
 
 
 @dataclass(frozen=True, slots=True, eq=False)

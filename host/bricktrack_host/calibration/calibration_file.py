@@ -19,14 +19,14 @@ from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
 from bricktrack_common.typed_data import convert, dump_json, load_json
 from bricktrack_host.calibration.calibration_file_v1 import upgraded_from_v1
-from bricktrack_host.calibration.central_rays import CentralRays
-from bricktrack_host.calibration.fit_residuals import PlaneResiduals
-from bricktrack_host.calibration.irt import TwoPlaneIrt
-from bricktrack_host.calibration.picture_region import ConvexRegion
-from bricktrack_host.calibration.pixel_polynomials import n_terms
-from bricktrack_host.calibration.ray_calibration import ModelChoice, RayCalibration
-from bricktrack_host.calibration.ray_fit import PlaneNoise
-from bricktrack_host.calibration.rig_tolerance import RigTolerance, RigUnknown
+from bricktrack_host.calibration.dots.picture_region import ConvexRegion
+from bricktrack_host.calibration.rays.central_rays import CentralRays
+from bricktrack_host.calibration.rays.fit_residuals import PlaneResiduals
+from bricktrack_host.calibration.rays.irt import TwoPlaneIrt
+from bricktrack_host.calibration.rays.pixel_polynomials import n_terms
+from bricktrack_host.calibration.rays.ray_calibration import ModelChoice, RayCalibration
+from bricktrack_host.calibration.rays.ray_fit import PlaneNoise
+from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance, RigUnknown
 
 FORMAT = "bricktrack-calibration"
 VERSION = 2
@@ -40,7 +40,7 @@ Millimetres = Annotated[float, msgspec.Meta(gt=0)]
 class CentralRaysRecord(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="model", tag="central"
 ):
-    """`bricktrack_host.calibration.central_rays.CentralRays` as stored.
+    """`bricktrack_host.calibration.rays.central_rays.CentralRays` as stored.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class CentralRaysRecord(
 class TwoPlaneRecord(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="model", tag="two-plane"
 ):
-    """`bricktrack_host.calibration.irt.TwoPlaneIrt` as stored.
+    """`bricktrack_host.calibration.rays.irt.TwoPlaneIrt` as stored.
 
     Attributes
     ----------

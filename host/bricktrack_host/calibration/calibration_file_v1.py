@@ -8,8 +8,8 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import CalibrationError
 from bricktrack_common.typed_data import convert
-from bricktrack_host.calibration.pixel_legendre import monomials_of_legendre
-from bricktrack_host.calibration.pixel_polynomials import n_terms
+from bricktrack_host.calibration.rays.pixel_legendre import monomials_of_legendre
+from bricktrack_host.calibration.rays.pixel_polynomials import n_terms
 
 Row = tuple[float, ...]
 

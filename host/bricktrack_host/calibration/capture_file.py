@@ -9,7 +9,7 @@ import msgspec
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
 from bricktrack_common.typed_data import load_toml
-from bricktrack_host.calibration.printed_target import DotTarget, check_target
+from bricktrack_host.calibration.target.printed_target import DotTarget, check_target
 
 CAPTURE_FILE = "capture.toml"
 VERSION = 1
@@ -60,7 +60,7 @@ class Capture(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     origin_near_px : (float, float) or None, px
         A pixel near a plain target's origin.
     origin_at : "centre" or "dot"
-        As `bricktrack_host.calibration.dot_grid.GridOrigin` means it.
+        As `bricktrack_host.calibration.dots.dot_grid.GridOrigin` means it.
     simulated : bool
     version : int
     """

@@ -6,7 +6,7 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.picture_region import ConvexRegion
+from bricktrack_host.calibration.dots.picture_region import ConvexRegion
 
 TRAVEL_MM = 5.0
 """How far the brick is shown off the axis, along x and y: more than an array's clearances allow."""

@@ -19,15 +19,15 @@ from bricktrack_host.calibration.calibration_file import (
     require_match,
     save_calibration,
 )
-from bricktrack_host.calibration.plane_pictures import merged_planes, n_left_out
-from bricktrack_host.calibration.ray_calibration import (
+from bricktrack_host.calibration.dots.plane_pictures import merged_planes, n_left_out
+from bricktrack_host.calibration.rays.ray_calibration import (
     ModelWish,
     OrderWish,
     RayCalibration,
     calibrate_rays,
 )
-from bricktrack_host.calibration.ray_uncertainty import CHI_95
-from bricktrack_host.calibration.rig_tolerance import RigTolerance
+from bricktrack_host.calibration.rays.ray_uncertainty import CHI_95
+from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance
 from bricktrack_host.cli._calibration_inputs import FitJob, observe_job
 from bricktrack_host.cli._console import err
 
@@ -43,7 +43,7 @@ class FitOptions:
     Attributes
     ----------
     model, order
-        As for `bricktrack_host.calibration.ray_calibration.calibrate_rays`.
+        As for `bricktrack_host.calibration.rays.ray_calibration.calibrate_rays`.
     shift_tolerance_mm, turn_tolerance_deg, bend_tolerance_mm : float
         How well the rig is known; 0 is exactly.
     report : bool

@@ -9,10 +9,10 @@ from bricktrack_common.camera_model import IMX219_1080P, SensorMode
 from bricktrack_common.errors import CalibrationError, ConfigError
 from bricktrack_common.typed_data import load_toml
 from bricktrack_host.calibration.capture_file import CAPTURE_FILE, Capture, load_capture
-from bricktrack_host.calibration.dot_detection import Polarity
-from bricktrack_host.calibration.dot_grid import GridOrigin
-from bricktrack_host.calibration.plane_pictures import PlanePicture, observe_pictures
-from bricktrack_host.calibration.printed_target import DotTarget, load_target
+from bricktrack_host.calibration.dots.dot_detection import Polarity
+from bricktrack_host.calibration.dots.dot_grid import GridOrigin
+from bricktrack_host.calibration.dots.plane_pictures import PlanePicture, observe_pictures
+from bricktrack_host.calibration.target.printed_target import DotTarget, load_target
 from bricktrack_host.cli._progress import counting_bar
 
 

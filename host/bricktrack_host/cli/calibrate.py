@@ -122,7 +122,7 @@ def fit(
     """
     # With OpenCV and SciPy behind it: not for `--help`.
     from bricktrack_common.camera_model import SensorMode
-    from bricktrack_host.calibration.dot_grid import GridOrigin
+    from bricktrack_host.calibration.dots.dot_grid import GridOrigin
     from bricktrack_host.cli._calibration_fit import FitOptions, order_wish, run_fit
     from bricktrack_host.cli._calibration_inputs import (
         FitJob,

@@ -18,9 +18,9 @@ from bricktrack_host.transfer.contact import Contact
 # With OpenCV and SciPy behind it: not for `--help`.
 if TYPE_CHECKING:
     from bricktrack_host.calibration.capture_file import Capture
-    from bricktrack_host.calibration.dot_detection import GreyImage
-    from bricktrack_host.calibration.picture_check import PictureCheck
-    from bricktrack_host.calibration.plane_pictures import PlanePicture
+    from bricktrack_host.calibration.dots.dot_detection import GreyImage
+    from bricktrack_host.calibration.dots.picture_check import PictureCheck
+    from bricktrack_host.calibration.dots.plane_pictures import PlanePicture
 
 _WHITE_LUMA = 235.0
 
@@ -88,9 +88,9 @@ def capture(
 
         bricktrack calibrate capture old --unit b1 --board target.toml --at-mm 101.117 --image near.png
     """
-    from bricktrack_host.calibration.averaging import mean_picture
     from bricktrack_host.calibration.capture_file import CapturedPicture, save_capture
-    from bricktrack_host.calibration.picture_check import check_picture
+    from bricktrack_host.calibration.dots.averaging import mean_picture
+    from bricktrack_host.calibration.dots.picture_check import check_picture
 
     if not 0 < at_mm < 1e5:
         raise ConfigError(f"--at-mm {at_mm:g}: expected the depth of the target's plane in mm, over 0")
@@ -131,7 +131,7 @@ def capture(
 def _begun(folder: Path, board: Path | None) -> "Capture | None":
     """Return what the folder holds already; refuse another target than its own."""
     from bricktrack_host.calibration.capture_file import CAPTURE_FILE, load_capture
-    from bricktrack_host.calibration.printed_target import load_target
+    from bricktrack_host.calibration.target.printed_target import load_target
 
     if not (folder / CAPTURE_FILE).exists():
         if board is None:
@@ -147,7 +147,7 @@ def _begun(folder: Path, board: Path | None) -> "Capture | None":
 
 
 def _from_files(files: list[Path], unit: str | None) -> _Taken:
-    from bricktrack_host.calibration.plane_pictures import read_grey
+    from bricktrack_host.calibration.dots.plane_pictures import read_grey
 
     return _Taken([read_grey(f)[0] for f in files], unit, ", ".join(f.name for f in files))
 
@@ -218,7 +218,7 @@ def _session(
     import msgspec
 
     from bricktrack_host.calibration.capture_file import Capture
-    from bricktrack_host.calibration.printed_target import load_target
+    from bricktrack_host.calibration.target.printed_target import load_target
 
     if before is not None:
         if taken.unit not in (None, before.unit):
@@ -247,7 +247,7 @@ def _session(
 
 
 def _observe(path: Path, z_mm: float, session: "Capture") -> "PlanePicture":
-    from bricktrack_host.calibration.plane_pictures import observe_pictures
+    from bricktrack_host.calibration.dots.plane_pictures import observe_pictures
     from bricktrack_host.cli._calibration_inputs import origin_of
 
     return observe_pictures(
@@ -257,8 +257,8 @@ def _observe(path: Path, z_mm: float, session: "Capture") -> "PlanePicture":
 
 def _moved_px(pictures: "list[GreyImage]", session: "Capture") -> float:
     """Return by how much the target moved from the first picture to the last."""
-    from bricktrack_host.calibration.averaging import shift_between_px
-    from bricktrack_host.calibration.plane_pictures import place_dots
+    from bricktrack_host.calibration.dots.averaging import shift_between_px
+    from bricktrack_host.calibration.dots.plane_pictures import place_dots
     from bricktrack_host.cli._calibration_inputs import origin_of
 
     if len(pictures) < 2:
@@ -284,7 +284,7 @@ def _save(folder: Path, name: str, picture: "GreyImage") -> Path:
 def _save_seen(path: Path, picture: "GreyImage", found: "PlanePicture") -> Path:
     import cv2
 
-    from bricktrack_host.calibration.picture_check import drawn_over
+    from bricktrack_host.calibration.dots.picture_check import drawn_over
 
     try:
         path.write_bytes(cv2.imencode(".png", drawn_over(picture, found))[1].tobytes())
@@ -298,7 +298,7 @@ def _report(
 ) -> None:
     from rich.table import Table
 
-    from bricktrack_host.calibration.averaging import MAX_SHIFT_PX
+    from bricktrack_host.calibration.dots.averaging import MAX_SHIFT_PX
 
     simulated = " (simulated)" if session.simulated else ""
     table = Table(title=f"Target at {at_mm:g} mm, unit {session.unit}{simulated}", show_header=False)

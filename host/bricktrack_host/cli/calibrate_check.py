@@ -87,7 +87,7 @@ def _job(
     """Return what to check with, and of which pictures the depth is known."""
     import msgspec
 
-    from bricktrack_host.calibration.dot_grid import GridOrigin
+    from bricktrack_host.calibration.dots.dot_grid import GridOrigin
     from bricktrack_host.cli._calibration_inputs import (
         FitJob,
         depth_and_file,
@@ -118,7 +118,7 @@ def _checked(stored: "Calibration", job: "FitJob", *, board_um: float) -> "list[
     from bricktrack_common.errors import CalibrationError
     from bricktrack_host.calibration.calibration_check import check_board
     from bricktrack_host.calibration.calibration_file import require_match
-    from bricktrack_host.calibration.plane_pictures import observe_pictures
+    from bricktrack_host.calibration.dots.plane_pictures import observe_pictures
     from bricktrack_host.cli._progress import counting_bar
 
     if job.mode is not None:

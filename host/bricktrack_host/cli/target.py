@@ -59,9 +59,9 @@ def target(
     import msgspec
     from rich.table import Table
 
-    from bricktrack_host.calibration.printed_target import target_toml
-    from bricktrack_host.calibration.target_drawing import draw_target, title_of
-    from bricktrack_host.calibration.target_size import GOOD_DOT_PX, field_of_angles, filling_target
+    from bricktrack_host.calibration.target.printed_target import target_toml
+    from bricktrack_host.calibration.target.target_drawing import draw_target, title_of
+    from bricktrack_host.calibration.target.target_size import GOOD_DOT_PX, field_of_angles, filling_target
     from bricktrack_host.cli._console import out
 
     a_mm, b_mm = planes_mm

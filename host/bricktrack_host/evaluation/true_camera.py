@@ -9,8 +9,8 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.camera_model import IMX219_1080P, RayModel, SensorMode
-from bricktrack_host.calibration.dot_observations import DotObservations
-from bricktrack_host.calibration.ray_calibration import calibrate_rays
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
+from bricktrack_host.calibration.rays.ray_calibration import calibrate_rays
 
 PLANE_A_MM, PLANE_B_MM = 101.117, 161.111
 PITCH_MM, COLUMNS, ROWS = 4.0, 54, 32

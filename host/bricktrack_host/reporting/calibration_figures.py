@@ -12,10 +12,10 @@ from matplotlib.tri import LinearTriInterpolator, Triangulation
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_host.calibration.calibration_comparison import CalibrationComparison
-from bricktrack_host.calibration.dot_data import Planes
-from bricktrack_host.calibration.picture_region import ConvexRegion
-from bricktrack_host.calibration.pixel_polynomials import picture_grid
-from bricktrack_host.calibration.ray_uncertainty import CHI_95, UncertainRays
+from bricktrack_host.calibration.dots.picture_region import ConvexRegion
+from bricktrack_host.calibration.rays.dot_data import Planes
+from bricktrack_host.calibration.rays.pixel_polynomials import picture_grid
+from bricktrack_host.calibration.rays.ray_uncertainty import CHI_95, UncertainRays
 from bricktrack_host.reporting.figure_layout import panel_row, picture_axes
 from bricktrack_host.reporting.page_measures import WIDTH_IN
 from bricktrack_host.reporting.plots import FUSED, IMPACT, INK, OPTICAL, TRUTH

@@ -10,12 +10,12 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.errors import StorageError
 from bricktrack_host.calibration.calibration_comparison import CalibrationComparison, compare_calibrations
 from bricktrack_host.calibration.calibration_file import Calibration
-from bricktrack_host.calibration.irt import TwoPlaneIrt
+from bricktrack_host.calibration.dots.picture_region import ConvexRegion
 from bricktrack_host.calibration.led_region import led_pixels, led_region
-from bricktrack_host.calibration.picture_region import ConvexRegion
-from bricktrack_host.calibration.pixel_polynomials import picture_grid
-from bricktrack_host.calibration.ray_calibration import RayCalibration
-from bricktrack_host.calibration.ray_uncertainty import CHI_95
+from bricktrack_host.calibration.rays.irt import TwoPlaneIrt
+from bricktrack_host.calibration.rays.pixel_polynomials import picture_grid
+from bricktrack_host.calibration.rays.ray_calibration import RayCalibration
+from bricktrack_host.calibration.rays.ray_uncertainty import CHI_95
 from bricktrack_host.reporting.calibration_sections import CalibrationEvidence, calibration_sections
 from bricktrack_host.reporting.page import Key, OriginTable, page_environment
 from bricktrack_host.reporting.plots import style

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from bricktrack_host.calibration.board_diagnostics import pixel_shape, print_error
 from bricktrack_host.calibration.calibration_comparison import CalibrationComparison
 from bricktrack_host.calibration.calibration_file import Calibration
-from bricktrack_host.calibration.central_rays import CentralRays
-from bricktrack_host.calibration.cross_validation import block_folds, left_out_errors_mm
-from bricktrack_host.calibration.picture_region import ConvexRegion
-from bricktrack_host.calibration.pixel_polynomials import picture_grid
-from bricktrack_host.calibration.ray_calibration import RayCalibration
+from bricktrack_host.calibration.dots.picture_region import ConvexRegion
+from bricktrack_host.calibration.rays.board_diagnostics import pixel_shape, print_error
+from bricktrack_host.calibration.rays.central_rays import CentralRays
+from bricktrack_host.calibration.rays.cross_validation import block_folds, left_out_errors_mm
+from bricktrack_host.calibration.rays.pixel_polynomials import picture_grid
+from bricktrack_host.calibration.rays.ray_calibration import RayCalibration
 from bricktrack_host.reporting import calibration_figures as draw
 from bricktrack_host.reporting.embedding import embed_figure
 from bricktrack_host.reporting.report_sections import Section, SectionTable

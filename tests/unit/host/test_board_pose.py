@@ -8,11 +8,11 @@ import pytest
 from board_pictures import BoardPose, Faults, camera_of, picture_of_board
 
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.averaging import mean_picture, shift_between_px
-from bricktrack_host.calibration.board_pose import board_pose
-from bricktrack_host.calibration.dot_grid import GridOrigin
-from bricktrack_host.calibration.plane_pictures import place_dots, read_grey
-from bricktrack_host.calibration.printed_target import DotTarget
+from bricktrack_host.calibration.dots.averaging import mean_picture, shift_between_px
+from bricktrack_host.calibration.dots.board_pose import board_pose
+from bricktrack_host.calibration.dots.dot_grid import GridOrigin
+from bricktrack_host.calibration.dots.plane_pictures import place_dots, read_grey
+from bricktrack_host.calibration.target.printed_target import DotTarget
 
 TARGET = DotTarget(columns=32, rows=20, pitch_mm=4.0, diameter_mm=2.0)
 SIZE = (960, 540)

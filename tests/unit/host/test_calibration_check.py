@@ -9,8 +9,8 @@ from pinhole import PinholeCamera
 
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.calibration.calibration_check import check_board
-from bricktrack_host.calibration.disc_bias import disc_bias_px
-from bricktrack_host.calibration.dot_observations import DotObservations
+from bricktrack_host.calibration.dots.disc_bias import disc_bias_px
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
 
 SD_PX = 0.05
 

@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 from bricktrack_common.brick_model import load_brick_model
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.board_diagnostics import pixel_shape, print_error
 from bricktrack_host.calibration.calibration_comparison import compare_calibrations
 from bricktrack_host.calibration.calibration_file import Target, make_calibration
-from bricktrack_host.calibration.central_rays import fit_central_rays
 from bricktrack_host.calibration.led_region import led_pixels, led_region
-from bricktrack_host.calibration.ray_calibration import calibrate_rays
+from bricktrack_host.calibration.rays.board_diagnostics import pixel_shape, print_error
+from bricktrack_host.calibration.rays.central_rays import fit_central_rays
+from bricktrack_host.calibration.rays.ray_calibration import calibrate_rays
 
 
 def calibrate(planes, **options):

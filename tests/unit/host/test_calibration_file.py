@@ -18,8 +18,8 @@ from bricktrack_host.calibration.calibration_file import (
     require_match,
     save_calibration,
 )
-from bricktrack_host.calibration.dot_observations import DotObservations
-from bricktrack_host.calibration.ray_calibration import calibrate_rays
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
+from bricktrack_host.calibration.rays.ray_calibration import calibrate_rays
 
 PLANES_MM = (101.117, 161.111)
 DATA = Path(__file__).resolve().parents[2] / "data" / "calibrations"

@@ -10,8 +10,8 @@ from lens_boards import A_MM, B_MM, Board, brown, see, two_planes
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import StorageError
 from bricktrack_host.calibration.calibration_file import Target, TargetImage, make_calibration
-from bricktrack_host.calibration.ray_calibration import calibrate_rays
-from bricktrack_host.calibration.rig_tolerance import RigTolerance
+from bricktrack_host.calibration.rays.ray_calibration import calibrate_rays
+from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance
 from bricktrack_host.reporting.calibration_report import (
     gathered_evidence,
     verdict,

@@ -7,11 +7,11 @@ import pytest
 from board_pictures import BoardPose, Faults, camera_of, picture_of_board, wrong_and_right
 
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_detection import detect_dots
-from bricktrack_host.calibration.dot_grid import GridOrigin, assign_coded_grid, assign_grid
-from bricktrack_host.calibration.dot_observations import board_turn_deg, in_picture_axes
-from bricktrack_host.calibration.grid_code import find_code
-from bricktrack_host.calibration.printed_target import DotTarget
+from bricktrack_host.calibration.dots.dot_detection import detect_dots
+from bricktrack_host.calibration.dots.dot_grid import GridOrigin, assign_coded_grid, assign_grid
+from bricktrack_host.calibration.dots.dot_observations import board_turn_deg, in_picture_axes
+from bricktrack_host.calibration.dots.grid_code import find_code
+from bricktrack_host.calibration.target.printed_target import DotTarget
 
 TARGET = DotTarget(columns=32, rows=20, pitch_mm=4.0, diameter_mm=2.0)
 CAMERA = camera_of()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bricktrack_common.errors import CalibrationError, ShapeError
-from bricktrack_host.calibration.dot_detection import detect_dots
-from bricktrack_host.calibration.dot_grid import GridOrigin, assign_grid
+from bricktrack_host.calibration.dots.dot_detection import detect_dots
+from bricktrack_host.calibration.dots.dot_grid import GridOrigin, assign_grid
 
 WIDTH, HEIGHT = 960, 540
 FOCAL_PX, K1, K2, P1 = 760.0, -0.18, 0.06, 2e-4

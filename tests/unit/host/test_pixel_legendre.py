@@ -3,8 +3,12 @@
 import numpy as np
 from scipy.special import eval_legendre
 
-from bricktrack_host.calibration.pixel_legendre import legendre_terms, monomials_of_legendre, term_degrees
-from bricktrack_host.calibration.pixel_polynomials import exponents, monomials
+from bricktrack_host.calibration.rays.pixel_legendre import (
+    legendre_terms,
+    monomials_of_legendre,
+    term_degrees,
+)
+from bricktrack_host.calibration.rays.pixel_polynomials import exponents, monomials
 
 ST = np.random.default_rng(1).uniform(-1, 1, (2, 40))
 

@@ -6,9 +6,14 @@ import pytest
 from board_pictures import BoardPose, Faults, camera_of, picture_of_board
 
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.merged_boards import merge_boards
-from bricktrack_host.calibration.plane_pictures import merged_planes, observe_pictures, place_dots, read_grey
-from bricktrack_host.calibration.printed_target import DotTarget
+from bricktrack_host.calibration.dots.merged_boards import merge_boards
+from bricktrack_host.calibration.dots.plane_pictures import (
+    merged_planes,
+    observe_pictures,
+    place_dots,
+    read_grey,
+)
+from bricktrack_host.calibration.target.printed_target import DotTarget
 
 TARGET = DotTarget(columns=18, rows=12, pitch_mm=4.0, diameter_mm=2.0)
 CAMERA = camera_of()

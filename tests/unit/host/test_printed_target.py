@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from bricktrack_common.errors import CalibrationError, ConfigError
-from bricktrack_host.calibration.printed_target import DotTarget, check_target, load_target, target_toml
+from bricktrack_host.calibration.target.printed_target import (
+    DotTarget,
+    check_target,
+    load_target,
+    target_toml,
+)
 
 SAMPLE = DotTarget(columns=54, rows=32, pitch_mm=4.0, diameter_mm=2.0)
 

@@ -20,11 +20,11 @@ from lens_boards import (
 
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.central_rays import fit_central_rays
-from bricktrack_host.calibration.dot_observations import DotObservations
-from bricktrack_host.calibration.irt import fit_two_plane_irt
-from bricktrack_host.calibration.ray_calibration import calibrate_rays
-from bricktrack_host.calibration.rig_tolerance import RigTolerance
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
+from bricktrack_host.calibration.rays.central_rays import fit_central_rays
+from bricktrack_host.calibration.rays.irt import fit_two_plane_irt
+from bricktrack_host.calibration.rays.ray_calibration import calibrate_rays
+from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance
 
 INSIDE_95 = 5.991  # 95 % of chi-square with two degrees of freedom
 

@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import CalibrationError, ShapeError
-from bricktrack_host.calibration.central_rays import fit_central_rays
-from bricktrack_host.calibration.cross_validation import left_out_errors_mm
-from bricktrack_host.calibration.disc_bias import disc_bias_px, disc_diameter_mm
-from bricktrack_host.calibration.dot_data import gather
-from bricktrack_host.calibration.dot_observations import DotObservations
-from bricktrack_host.calibration.gross_outliers import gross_outliers
-from bricktrack_host.calibration.irt import fit_two_plane_irt
-from bricktrack_host.calibration.ray_calibration import calibrate_rays, centrality_test, choose_model
-from bricktrack_host.calibration.ray_families import CentralFamily, TwoPlaneFamily
-from bricktrack_host.calibration.ray_fit import fit_rays, terms_needed
+from bricktrack_host.calibration.dots.disc_bias import disc_bias_px, disc_diameter_mm
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
+from bricktrack_host.calibration.rays.central_rays import fit_central_rays
+from bricktrack_host.calibration.rays.cross_validation import left_out_errors_mm
+from bricktrack_host.calibration.rays.dot_data import gather
+from bricktrack_host.calibration.rays.gross_outliers import gross_outliers
+from bricktrack_host.calibration.rays.irt import fit_two_plane_irt
+from bricktrack_host.calibration.rays.ray_calibration import calibrate_rays, centrality_test, choose_model
+from bricktrack_host.calibration.rays.ray_families import CentralFamily, TwoPlaneFamily
+from bricktrack_host.calibration.rays.ray_fit import fit_rays, terms_needed
 
 A_MM, B_MM = 101.117, 161.111
 FOCAL_PX, K1, K2, K3, P1, P2 = 1650.0, -0.28, 0.10, -0.02, 3e-4, -2e-4

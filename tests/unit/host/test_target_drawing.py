@@ -6,11 +6,11 @@ import pytest
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_detection import detect_dots
-from bricktrack_host.calibration.dot_grid import assign_coded_grid
-from bricktrack_host.calibration.printed_target import DotTarget, load_target
-from bricktrack_host.calibration.target_drawing import PAPERS_MM, draw_target, smallest_paper
-from bricktrack_host.calibration.target_size import field_of_angles, filling_target
+from bricktrack_host.calibration.dots.dot_detection import detect_dots
+from bricktrack_host.calibration.dots.dot_grid import assign_coded_grid
+from bricktrack_host.calibration.target.printed_target import DotTarget, load_target
+from bricktrack_host.calibration.target.target_drawing import PAPERS_MM, draw_target, smallest_paper
+from bricktrack_host.calibration.target.target_size import field_of_angles, filling_target
 from bricktrack_host.cli.main import app
 
 PX_PER_MM = 8.0

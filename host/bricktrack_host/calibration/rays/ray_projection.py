@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.camera_model import Projection
-from bricktrack_host.calibration.pixel_polynomials import PixelScaling, as_points, in_chunks
+from bricktrack_host.calibration.rays.pixel_polynomials import PixelScaling, as_points, in_chunks
 
 
 def project_in_chunks(

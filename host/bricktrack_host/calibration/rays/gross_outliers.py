@@ -5,9 +5,9 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_observations import DotObservations
-from bricktrack_host.calibration.neighbours import median_spacing
-from bricktrack_host.calibration.pixel_polynomials import PixelScaling, least_squares, monomials, n_terms
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
+from bricktrack_host.calibration.dots.neighbours import median_spacing
+from bricktrack_host.calibration.rays.pixel_polynomials import PixelScaling, least_squares, monomials, n_terms
 
 OUTLIER_SIGMAS = 6.0
 OUTLIER_STEPS = 0.01

@@ -7,7 +7,7 @@ from reportlab.lib.units import mm
 from reportlab.pdfgen.canvas import Canvas
 
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.printed_target import LARGE_RATIO, DotTarget, check_target
+from bricktrack_host.calibration.target.printed_target import LARGE_RATIO, DotTarget, check_target
 
 PAPERS_MM: dict[str, tuple[float, float]] = {
     name: (round(max(size) / mm, 1), round(min(size) / mm, 1))

@@ -10,11 +10,11 @@ import numpy as np
 
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_detection import Dots, GreyImage, Polarity, detect_dots
-from bricktrack_host.calibration.dot_grid import GridOrigin, assign_coded_grid, assign_grid
-from bricktrack_host.calibration.dot_observations import DotObservations, in_picture_axes
-from bricktrack_host.calibration.merged_boards import MergedBoards, merge_boards
-from bricktrack_host.calibration.printed_target import DotTarget
+from bricktrack_host.calibration.dots.dot_detection import Dots, GreyImage, Polarity, detect_dots
+from bricktrack_host.calibration.dots.dot_grid import GridOrigin, assign_coded_grid, assign_grid
+from bricktrack_host.calibration.dots.dot_observations import DotObservations, in_picture_axes
+from bricktrack_host.calibration.dots.merged_boards import MergedBoards, merge_boards
+from bricktrack_host.calibration.target.printed_target import DotTarget
 
 
 @dataclass(frozen=True, slots=True, eq=False)

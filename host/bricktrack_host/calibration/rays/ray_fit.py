@@ -17,16 +17,16 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_data import DotData, central_start
-from bricktrack_host.calibration.pixel_polynomials import UNDETERMINED, n_terms
-from bricktrack_host.calibration.ray_families import (
+from bricktrack_host.calibration.rays.dot_data import DotData, central_start
+from bricktrack_host.calibration.rays.pixel_polynomials import UNDETERMINED, n_terms
+from bricktrack_host.calibration.rays.ray_families import (
     ALWAYS_FREE,
     NON_CENTRAL,
     CentralFamily,
     RayFamily,
     TwoPlaneFamily,
 )
-from bricktrack_host.calibration.rig_tolerance import RigTolerance, RigUnknown, RigUnknowns
+from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance, RigUnknown, RigUnknowns
 
 FREE_ORDER = 3
 """Degrees up to this are never held: scale, aspect and the main distortion."""

@@ -6,10 +6,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.calibration.central_rays import CentralRays
-from bricktrack_host.calibration.dot_data import Planes
-from bricktrack_host.calibration.irt import TwoPlaneIrt
-from bricktrack_host.calibration.pixel_polynomials import picture_grid
+from bricktrack_host.calibration.rays.central_rays import CentralRays
+from bricktrack_host.calibration.rays.dot_data import Planes
+from bricktrack_host.calibration.rays.irt import TwoPlaneIrt
+from bricktrack_host.calibration.rays.pixel_polynomials import picture_grid
 
 LEAST_COMMON_DOTS = 30
 """Fewer dots in common say nothing of the print."""

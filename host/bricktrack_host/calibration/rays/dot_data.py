@@ -8,9 +8,9 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_observations import DotObservations
-from bricktrack_host.calibration.pixel_legendre import legendre_terms
-from bricktrack_host.calibration.pixel_polynomials import (
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
+from bricktrack_host.calibration.rays.pixel_legendre import legendre_terms
+from bricktrack_host.calibration.rays.pixel_polynomials import (
     PixelPolynomial,
     PixelScaling,
     least_squares,

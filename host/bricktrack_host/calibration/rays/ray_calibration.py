@@ -17,16 +17,16 @@ from scipy.special import fdtrc, ndtr
 
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.central_rays import CentralRays, central_rays_of
-from bricktrack_host.calibration.cross_validation import CrossValidatedError, ModelKind, cross_validate
-from bricktrack_host.calibration.disc_bias import disc_bias_px, disc_diameter_mm
-from bricktrack_host.calibration.dot_data import Planes, central_start, gather
-from bricktrack_host.calibration.gross_outliers import gross_outliers
-from bricktrack_host.calibration.irt import PAPER_ORDER, TwoPlaneIrt, two_plane_irt_of
-from bricktrack_host.calibration.pixel_polynomials import n_terms, picture_grid
-from bricktrack_host.calibration.ray_families import CentralFamily, RayFamily, TwoPlaneFamily
-from bricktrack_host.calibration.ray_fit import FREE_ORDER, RayFit, fit_rays, terms_needed
-from bricktrack_host.calibration.rig_tolerance import RigTolerance, RigUnknown
+from bricktrack_host.calibration.dots.disc_bias import disc_bias_px, disc_diameter_mm
+from bricktrack_host.calibration.rays.central_rays import CentralRays, central_rays_of
+from bricktrack_host.calibration.rays.cross_validation import CrossValidatedError, ModelKind, cross_validate
+from bricktrack_host.calibration.rays.dot_data import Planes, central_start, gather
+from bricktrack_host.calibration.rays.gross_outliers import gross_outliers
+from bricktrack_host.calibration.rays.irt import PAPER_ORDER, TwoPlaneIrt, two_plane_irt_of
+from bricktrack_host.calibration.rays.pixel_polynomials import n_terms, picture_grid
+from bricktrack_host.calibration.rays.ray_families import CentralFamily, RayFamily, TwoPlaneFamily
+from bricktrack_host.calibration.rays.ray_fit import FREE_ORDER, RayFit, fit_rays, terms_needed
+from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance, RigUnknown
 
 ModelWish = Literal["auto", "central", "walking-pupil", "two-plane"]
 OrderWish = int | Literal["held", "cross-validated"]
@@ -124,7 +124,7 @@ def calibrate_rays(
     Parameters
     ----------
     planes : sequence of (float, DotObservations)
-        With centroids as `bricktrack_host.calibration.dot_detection` measures them.
+        With centroids as `bricktrack_host.calibration.dots.dot_detection` measures them.
     sensor_mode : SensorMode
     model : "auto", "central", "walking-pupil" or "two-plane", optional
     order : int, "held" or "cross-validated", optional

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.calibration.pixel_polynomials import as_points, in_chunks
+from bricktrack_host.calibration.rays.pixel_polynomials import as_points, in_chunks
 
 CHI_95 = float(np.sqrt(5.991))
 """Half-axis of the 95 % ellipse of two normal numbers, in standard deviations."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_host.calibration.pixel_polynomials import exponents, n_terms
+from bricktrack_host.calibration.rays.pixel_polynomials import exponents, n_terms
 
 
 def legendre_terms(st: FloatArray, order: int) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.neighbours import Neighbours
+from bricktrack_host.calibration.dots.neighbours import Neighbours
 
 MIN_DOTS = 16
 CATCH_STEPS = 0.3

@@ -1,6 +1,6 @@
 """Give each dot of a target picture its column and row, and from an origin its place in millimetres.
 
-The grid is grown (`bricktrack_host.calibration.grid_growth`); what remains is where on the target it lies.
+The grid is grown (see `.grid_growth`); what remains is where on the target it lies.
 A coded target tells that itself, a plain one by an origin that is nominated, or by being in view whole.
 Whatever leaves a doubt is refused: a grid off by one column fits as well.
 """
@@ -12,12 +12,12 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_detection import Dots
-from bricktrack_host.calibration.dot_observations import DotObservations
-from bricktrack_host.calibration.dot_sizes import area_ratios, size_classes
-from bricktrack_host.calibration.grid_code import find_code
-from bricktrack_host.calibration.grid_growth import MIN_DOTS, grid_coordinates, grow_grid
-from bricktrack_host.calibration.printed_target import LARGE_RATIO, DotTarget
+from bricktrack_host.calibration.dots.dot_detection import Dots
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
+from bricktrack_host.calibration.dots.dot_sizes import area_ratios, size_classes
+from bricktrack_host.calibration.dots.grid_code import find_code
+from bricktrack_host.calibration.dots.grid_growth import MIN_DOTS, grid_coordinates, grow_grid
+from bricktrack_host.calibration.target.printed_target import LARGE_RATIO, DotTarget
 
 MAX_TURN_DEG = 44.5
 """Beyond this turn of a plain board, rows and columns cannot be told apart."""

@@ -7,10 +7,10 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_data import Planes
-from bricktrack_host.calibration.neighbours import median_spacing
-from bricktrack_host.calibration.ray_fit import RayFit
-from bricktrack_host.calibration.ray_uncertainty import UncertainRays
+from bricktrack_host.calibration.dots.neighbours import median_spacing
+from bricktrack_host.calibration.rays.dot_data import Planes
+from bricktrack_host.calibration.rays.ray_fit import RayFit
+from bricktrack_host.calibration.rays.ray_uncertainty import UncertainRays
 
 ModelKind = Literal["central", "walking-pupil", "two-plane"]
 

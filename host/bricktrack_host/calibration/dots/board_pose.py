@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_observations import DotObservations, board_turn_deg
+from bricktrack_host.calibration.dots.dot_observations import DotObservations, board_turn_deg
 
 AXIS_SD = 0.01
 """Standard deviation of the lens axis's place, share of the picture's width: some 20 px of 1920."""

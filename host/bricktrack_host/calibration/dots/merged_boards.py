@@ -11,8 +11,8 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_observations import DotObservations
-from bricktrack_host.calibration.picture_region import ConvexRegion
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
+from bricktrack_host.calibration.dots.picture_region import ConvexRegion
 
 MIN_OVERLAP = 20
 """So many dots of a board must lie among those of the others."""

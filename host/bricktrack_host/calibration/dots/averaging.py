@@ -6,8 +6,8 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.dot_detection import GreyImage
-from bricktrack_host.calibration.dot_observations import DotObservations
+from bricktrack_host.calibration.dots.dot_detection import GreyImage
+from bricktrack_host.calibration.dots.dot_observations import DotObservations
 
 MAX_SHIFT_PX = 0.1
 """By which dots may move between the first and the last picture."""

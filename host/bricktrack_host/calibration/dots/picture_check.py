@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.calibration.board_pose import BoardPose, board_pose
-from bricktrack_host.calibration.dot_detection import GreyImage
-from bricktrack_host.calibration.neighbours import Neighbours, median_spacing
-from bricktrack_host.calibration.picture_region import ConvexRegion
-from bricktrack_host.calibration.plane_pictures import PlanePicture
+from bricktrack_host.calibration.dots.board_pose import BoardPose, board_pose
+from bricktrack_host.calibration.dots.dot_detection import GreyImage
+from bricktrack_host.calibration.dots.neighbours import Neighbours, median_spacing
+from bricktrack_host.calibration.dots.picture_region import ConvexRegion
+from bricktrack_host.calibration.dots.plane_pictures import PlanePicture
 
 MIN_COVERED = 0.8
 """Whole dots that fill the picture surround some 85 % of it: up to a pitch is lost all round."""

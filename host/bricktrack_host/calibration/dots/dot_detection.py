@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.errors import CalibrationError, ShapeError
-from bricktrack_host.calibration.cut_dots import CompletedDot, complete_cut_dot
-from bricktrack_host.calibration.dot_regions import (
+from bricktrack_host.calibration.dots.cut_dots import CompletedDot, complete_cut_dot
+from bricktrack_host.calibration.dots.dot_regions import (
     MIN_AREA_PX2,
     MIN_CONTRAST_GREY,
     Light,
     Regions,
     round_regions,
 )
-from bricktrack_host.calibration.dot_sizes import LARGE_AREA_RATIO, area_ratios, have_odd_shapes
-from bricktrack_host.calibration.neighbours import Neighbours, median_spacing
+from bricktrack_host.calibration.dots.dot_sizes import LARGE_AREA_RATIO, area_ratios, have_odd_shapes
+from bricktrack_host.calibration.dots.neighbours import Neighbours, median_spacing
 
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 """8 bits, or 16 bits full scale: the mean of several pictures."""
@@ -50,7 +50,7 @@ class Dots:
     touches_border : ndarray of bool, shape (n,)
         The picture's border cuts the dot or its blurred rim: the moments are not those of the disc.
     is_completed : ndarray of bool, shape (n,)
-        A cut dot's centre was found from its visible rim after all (`bricktrack_host.calibration.cut_dots`).
+        A cut dot's centre was found from its visible rim after all (see `.cut_dots`).
     polarity : "white-on-black" or "black-on-white"
     blur_px : ndarray, shape (n,), px
         Standard deviation of the rim's blur; NaN where the border cuts the dot.

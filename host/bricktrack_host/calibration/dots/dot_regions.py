@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.calibration.neighbours import Neighbours
+from bricktrack_host.calibration.dots.neighbours import Neighbours
 
 Light = NDArray[np.float32]
 """Grey levels from 0 to 255, not necessarily whole."""

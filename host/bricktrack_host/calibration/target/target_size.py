@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.printed_target import DotTarget
+from bricktrack_host.calibration.target.printed_target import DotTarget
 
 FEWEST_COLUMNS_SEEN = 24
 """Across the picture at the near plane: enough for the polynomials that a lens needs."""

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.camera_model import Projection, SensorMode
-from bricktrack_host.calibration.dot_data import Planes, central_start, gather
-from bricktrack_host.calibration.fit_residuals import PlaneResiduals, residuals_of
-from bricktrack_host.calibration.picture_region import ConvexRegion
-from bricktrack_host.calibration.pixel_legendre import legendre_terms, monomials_of_legendre
-from bricktrack_host.calibration.pixel_polynomials import (
+from bricktrack_host.calibration.dots.picture_region import ConvexRegion
+from bricktrack_host.calibration.rays.dot_data import Planes, central_start, gather
+from bricktrack_host.calibration.rays.fit_residuals import PlaneResiduals, residuals_of
+from bricktrack_host.calibration.rays.pixel_legendre import legendre_terms, monomials_of_legendre
+from bricktrack_host.calibration.rays.pixel_polynomials import (
     NEAREST_SHARE,
     InverseStart,
     PixelPolynomial,
@@ -30,11 +30,11 @@ from bricktrack_host.calibration.pixel_polynomials import (
     newton_inverse,
     picture_grid,
 )
-from bricktrack_host.calibration.ray_families import TwoPlaneFamily, two_plane_rows
-from bricktrack_host.calibration.ray_fit import RayFit, fit_rays, terms_needed
-from bricktrack_host.calibration.ray_projection import pixel_jacobian, project_in_chunks
-from bricktrack_host.calibration.ray_uncertainty import UncertainRays
-from bricktrack_host.calibration.rig_tolerance import RigTolerance
+from bricktrack_host.calibration.rays.ray_families import TwoPlaneFamily, two_plane_rows
+from bricktrack_host.calibration.rays.ray_fit import RayFit, fit_rays, terms_needed
+from bricktrack_host.calibration.rays.ray_projection import pixel_jacobian, project_in_chunks
+from bricktrack_host.calibration.rays.ray_uncertainty import UncertainRays
+from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance
 
 PAPER_ORDER = 5
 

@@ -16,8 +16,8 @@ from typing import Protocol
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_host.calibration.pixel_legendre import term_degrees
-from bricktrack_host.calibration.pixel_polynomials import n_terms
+from bricktrack_host.calibration.rays.pixel_legendre import term_degrees
+from bricktrack_host.calibration.rays.pixel_polynomials import n_terms
 
 ALWAYS_FREE = -1
 """The degree of a parameter that is no polynomial's: never held back."""

@@ -7,8 +7,8 @@ neighbourhood are compared.
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.calibration.neighbours import Neighbours
-from bricktrack_host.calibration.printed_target import LARGE_RATIO
+from bricktrack_host.calibration.dots.neighbours import Neighbours
+from bricktrack_host.calibration.target.printed_target import LARGE_RATIO
 
 LARGE_AREA_RATIO = LARGE_RATIO**2
 MAX_ODD = 0.35

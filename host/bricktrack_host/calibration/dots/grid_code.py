@@ -11,8 +11,8 @@ from scipy.signal import correlate
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.calibration.neighbours import Neighbours
-from bricktrack_host.calibration.printed_target import DotTarget
+from bricktrack_host.calibration.dots.neighbours import Neighbours
+from bricktrack_host.calibration.target.printed_target import DotTarget
 
 MIN_READ = 30
 """Fewer dots of known size than this are not asked."""

@@ -1,0 +1,1 @@
+"""The dots of a printed target in a picture: found, named, measured."""

@@ -1,0 +1,1 @@
+"""Ray models of a camera, fitted to dots at two planes or more."""

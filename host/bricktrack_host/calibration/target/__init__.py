@@ -1,0 +1,1 @@
+"""The printed target of dots: its geometry, its drawing, what it can calibrate."""
