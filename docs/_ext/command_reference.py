@@ -58,7 +58,7 @@ def _prose(command: Any) -> str:
     parts: list[str] = []
     for text in (command.help, command.epilog):
         for paragraph in re.split(r"\n\s*\n", inspect.cleandoc(text or "")):
-            words = " ".join(paragraph.split())
+            words = " ".join(paragraph.replace("\\\n", " ").split())
             if not _EXAMPLE.match(words):
                 parts.append(_escaped(words))
             elif parts and parts[-1].startswith("```"):

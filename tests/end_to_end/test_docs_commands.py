@@ -160,7 +160,9 @@ LEAVES = dict(leaf for name, program in PROGRAMS.items() for leaf in _leaves(pro
 def test_the_examples_in_a_help_text_are_commands_the_program_takes(path):
     command = LEAVES[path]
     text = "\n\n".join(filter(None, (command.help, command.epilog)))
-    paragraphs = [_PREFIX.sub("", " ".join(part.split())) for part in re.split(r"\n\s*\n", text)]
+    paragraphs = [
+        _PREFIX.sub("", " ".join(part.replace("\\\n", " ").split())) for part in re.split(r"\n\s*\n", text)
+    ]
     examples = [part for part in paragraphs if re.match(r"bricktrackd? [^ ]", part)]
     assert examples, f"'{path} --help' shows no example"
     refused = [f"{line}: {why}" for line in examples if (why := why_refused(words_of(line), whole=True))]

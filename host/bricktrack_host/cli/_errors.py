@@ -7,6 +7,7 @@ from typer.core import TyperGroup
 
 from bricktrack_common.errors import BricktrackError
 from bricktrack_host.cli._console import err, say_error
+from bricktrack_host.cli._help import tidy_help
 
 EXIT_ERROR = 1
 EXIT_INTERRUPTED = 130
@@ -14,6 +15,10 @@ EXIT_INTERRUPTED = 130
 
 class BricktrackGroup(TyperGroup):
     """The top group; it wraps every command below it, those of mounted apps too."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        tidy_help(self)
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; exit with 1 after a `BricktrackError`, with 130 after Ctrl-C."""

@@ -26,7 +26,7 @@ def align(
     runs: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="RUN...", help="Processed runs, or their results folders.", show_default=False
+            metavar="RUN", help="Processed runs, or their results folders.", show_default=False
         ),
     ] = None,
     poses: Annotated[

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def combine(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Processed runs of one shake, one a unit.")
+        list[Path], typer.Argument(metavar="RUN", help="Processed runs of one shake, one a unit.")
     ],
     name: Annotated[str, typer.Option("--name", "-n", help="Name of the test.")],
     fleet: FleetOption = None,

@@ -25,7 +25,7 @@ def compare(
     after: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[AFTER]",
+            metavar="AFTER",
             help="Likewise. \\[default: BEFORE as it is now, against what its last processing replaced]",
             show_default=False,
         ),

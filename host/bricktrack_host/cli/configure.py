@@ -25,7 +25,7 @@ def configure(
     settings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[KEY=VALUE]...", help="What to change; without any, show what is.", show_default=False
+            metavar="KEY=VALUE", help="What to change; without any, show what is.", show_default=False
         ),
     ] = None,
     reset: Annotated[

@@ -25,7 +25,7 @@ DatasetArgument = Annotated[Path, typer.Argument(metavar="DATASET", help="Its fo
 def add(
     dataset: DatasetArgument,
     sources: Annotated[
-        list[Path], typer.Argument(metavar="TEST|RUN...", help="Combined tests, or processed runs.")
+        list[Path], typer.Argument(metavar="TEST|RUN", help="Combined tests, or processed runs.")
     ],
     test: Annotated[
         str | None,

@@ -40,7 +40,7 @@ class _Doomed:
 def delete(
     runs: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[RUN]...", help="Ids or patterns as '*_shake-07'.", show_default=False),
+        typer.Argument(metavar="RUN", help="Ids or patterns as '*_shake-07'.", show_default=False),
     ] = None,
     confirmed: Annotated[
         bool, typer.Option("--confirmed", help="All runs that a host has confirmed.")

@@ -22,7 +22,7 @@ def evaluate(
     run: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[RUN]", help="A processed run of a brick moved in known steps. Default: simulate."
+            metavar="RUN", help="A processed run of a brick moved in known steps. Default: simulate."
         ),
     ] = None,
     positions: Annotated[

@@ -46,7 +46,7 @@ FileOption = Annotated[
 ]
 UnitsArgument = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[UNIT]...", help="Units of the fleet, or patterns as 'c-*'; all without one."),
+    typer.Argument(metavar="UNIT", help="Units of the fleet, or patterns as 'c-*'; all without one."),
 ]
 SshOption = Annotated[
     str, typer.Option("--ssh", help="User at each unit's address, or user@host for a single unit.")
