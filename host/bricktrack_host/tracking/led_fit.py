@@ -17,9 +17,9 @@ from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.first_poses import FirstPoses
 from bricktrack_host.tracking.frame_motion import calm_frames, carried_px, led_times_ns, motion_to_leds
 from bricktrack_host.tracking.led_profile import UNKNOWN_SHIFT_PER_RADIUS, predict_brick, shift_per_radius
-from bricktrack_host.tracking.led_tracker import NOT_USED
 from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import OWN_SHARE, RefinedPoses, refine_poses
+from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
 from bricktrack_host.tracks import LedObservations
 
 _MIN_LEDS = 5  # four leave two degrees of freedom, which one collar and a false pose share too easily
@@ -110,16 +110,11 @@ def fit_collar(
     -----
     Gauss-Newton on the collar with the poses eliminated in every frame (variable projection).
     """
-    used = ((observations.led_flags & NOT_USED) == 0) & all_finite(observations.uv_px)
-    frames = np.flatnonzero(used.sum(axis=1) >= _MIN_LEDS)
-    if frames.size < _MIN_FRAMES:
-        raise CalibrationError(
-            f"{frames.size} frames with {_MIN_LEDS} or more whole LEDs; the LED profile needs {_MIN_FRAMES}. "
-            "Record a sweep with all LEDs in view."
-        )
-    uv = np.where(used[..., None], observations.uv_px, np.nan)[frames]
-    problem = _Problem(uv, observations.cov_px2[frames], ray_model, brick_model)
-    everything = np.ones(frames.size, dtype=bool)
+    uv, cov = sweep_frames(
+        observations, wanted="the LED profile needs", min_leds=_MIN_LEDS, min_frames=_MIN_FRAMES
+    )
+    problem = _Problem(uv, cov, ray_model, brick_model)
+    everything = np.ones(len(uv), dtype=bool)
     collar = problem.solve(everything, start_mm)
     longest = max_collar_radii * float(brick_model.led_radii_mm.max())
     if -_BARELY_NEGATIVE_MM <= collar < 0:
@@ -134,7 +129,7 @@ def fit_collar(
     score = np.nansum(slope * residual, axis=1)
     # Sandwich: the frames' scores scatter as they do, whatever the centroids' covariance says.
     sd = float(np.sqrt(np.sum(score**2)) / information.sum())
-    folds = np.arange(frames.size) % min(_N_FOLDS, frames.size)
+    folds = np.arange(len(uv)) % _N_FOLDS
     held_out = np.full(uv.shape, np.nan)
     for fold in np.unique(folds):
         out = folds == fold
@@ -145,10 +140,10 @@ def fit_collar(
         collar_mm=collar,
         sd_mm=sd,
         shift_sd_per_radius=problem.shift_sd_per_radius(collar, sd),
-        rms_px=_rms(problem.poses(collar).residual_px),
-        cross_validated_rms_px=_rms(held_out),
-        rms_without_px=_rms(without),
-        n_frames=int(frames.size),
+        rms_px=rms_px(problem.poses(collar).residual_px),
+        cross_validated_rms_px=rms_px(held_out),
+        rms_without_px=rms_px(without),
+        n_frames=len(uv),
         n_leds=int(np.isfinite(uv[..., 0]).sum()),
     )
 
@@ -208,10 +203,6 @@ def with_profile_of_run(
         shift_sd_per_radius=max(fit.shift_sd_per_radius, _SELF_FIT_SHIFT_SD),
     )
     return replace(brick_model, led_profile=profile)
-
-
-def _rms(residual_px: FloatArray) -> float:
-    return float(np.sqrt(np.nanmean(residual_px**2)))
 
 
 class _Problem:

@@ -17,9 +17,9 @@ from bricktrack_common.errors import CalibrationError
 from bricktrack_common.rotations import skew
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_profile import collar_of, predict_brick
-from bricktrack_host.tracking.led_tracker import NOT_USED
 from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
+from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
 from bricktrack_host.tracks import LedObservations
 
 _MIN_LEDS = 6  # five tell of a pose and four coordinates more, of twelve that are sought
@@ -106,22 +106,17 @@ def fit_positions(
             f"the layout '{brick_model.name}' has no [led_profile]; domes would pass for other places. "
             "Fit the profile first"
         )
-    used = ((observations.led_flags & NOT_USED) == 0) & all_finite(observations.uv_px)
-    frames = np.flatnonzero(used.sum(axis=1) >= _MIN_LEDS)
-    if frames.size < _MIN_FRAMES:
-        raise CalibrationError(
-            f"{frames.size} frames with {_MIN_LEDS} or more whole LEDs; LED positions need {_MIN_FRAMES}. "
-            "Record a sweep with all LEDs in view."
-        )
-    uv = np.where(used[..., None], observations.uv_px, np.nan)[frames]
-    problem = _Problem(uv, observations.cov_px2[frames], ray_model, brick_model, tolerance_mm, with_collar)
-    everything = np.ones(frames.size, dtype=np.bool_)
+    uv, cov = sweep_frames(
+        observations, wanted="LED positions need", min_leds=_MIN_LEDS, min_frames=_MIN_FRAMES
+    )
+    problem = _Problem(uv, cov, ray_model, brick_model, tolerance_mm, with_collar)
+    everything = np.ones(len(uv), dtype=np.bool_)
     solved = problem.solve(everything)
     positions = problem.positions_mm(solved)
     sd_mm, collar_sd_mm = problem.sd_mm(solved)
     poses = problem.poses(solved)
     with np.errstate(invalid="ignore"):
-        strange = (poses.sigmas > _OUTLIER_SIGMAS).sum(axis=0) / np.maximum(used[frames].sum(axis=0), 1)
+        strange = (poses.sigmas > _OUTLIER_SIGMAS).sum(axis=0) / np.maximum(all_finite(uv).sum(axis=0), 1)
     if strange.max() > 0.5:
         k = int(strange.argmax())
         raise CalibrationError(
@@ -135,7 +130,7 @@ def fit_positions(
             f"LED {brick_model.led_names[k]} comes out {off_mm[k]:.2f} mm from where the layout has it; "
             f"expected within {5 * tolerance_mm:g} mm. Check the layout, or allow more by the tolerance"
         )
-    folds = np.arange(frames.size) % _N_FOLDS
+    folds = np.arange(len(uv)) % _N_FOLDS
     held_out = np.full(uv.shape, np.nan)
     for fold in range(_N_FOLDS):
         out = folds == fold
@@ -145,10 +140,10 @@ def fit_positions(
         sd_mm=sd_mm,
         collar_mm=float(solved[-1]),
         collar_sd_mm=collar_sd_mm if with_collar else 0.0,
-        rms_px=_rms(poses.residual_px),
-        cross_validated_rms_px=_rms(held_out),
-        rms_before_px=_rms(problem.poses(problem.start).residual_px),
-        n_frames=int(frames.size),
+        rms_px=rms_px(poses.residual_px),
+        cross_validated_rms_px=rms_px(held_out),
+        rms_before_px=rms_px(problem.poses(problem.start).residual_px),
+        n_frames=len(uv),
     )
 
 
@@ -164,10 +159,6 @@ def free_directions(positions_mm: FloatArray) -> FloatArray:
     fixed[:, 6] = positions_mm.ravel()
     Q, _ = np.linalg.qr(fixed, mode="complete")
     return np.asarray(Q[:, 7:])
-
-
-def _rms(residual_px: FloatArray) -> float:
-    return float(np.sqrt(np.nanmean(residual_px**2)))
 
 
 class _Problem:
