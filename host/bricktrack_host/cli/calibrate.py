@@ -36,7 +36,7 @@ def fit(
             metavar="Z=FILE",
         ),
     ] = None,
-    rig: Annotated[Path | None, typer.Option(help="Rig file with a [calibration] table.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="Rig file with a \\[calibration] table.")] = None,
     target: Annotated[str | None, typer.Option(help="Which target of the rig file, by name.")] = None,
     images_dir: Annotated[
         Path | None, typer.Option(help="Folder of the rig file's pictures; the rig file's own by default.")

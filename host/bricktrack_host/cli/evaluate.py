@@ -28,7 +28,7 @@ def evaluate(
     positions: Annotated[
         Path | None,
         typer.Option(
-            help="CSV of RUN's reference positions: start_s, end_s, x_mm, y_mm, z_mm[, rx_deg ...]."
+            help="CSV of RUN's reference positions: start_s, end_s, x_mm, y_mm, z_mm\\[, rx_deg ...]."
         ),
     ] = None,
     align: Annotated[

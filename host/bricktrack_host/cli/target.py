@@ -13,7 +13,7 @@ def target(
     fov_deg: Annotated[
         tuple[float, float],
         typer.Option(
-            help="The camera's angles of view, across and down. [default: IMX219, 1920 x 1080 crop]",
+            help="The camera's angles of view, across and down. \\[default: IMX219, 1920 x 1080 crop]",
             metavar="H V",
             show_default=False,
         ),

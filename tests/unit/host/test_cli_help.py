@@ -40,6 +40,7 @@ def test_no_line_is_cut_and_every_option_is_named_whole(path):
     assert max(len(line) for line in shown.splitlines()) <= 80
     assert "…" not in shown
     for parameter in _command(path).params:
+        assert not re.search(r"(?<!\\)\[", parameter.help or ""), f"{parameter.help} (taken for markup)"
         for name in (*parameter.opts, *parameter.secondary_opts):
             if name.startswith("--") and not name.startswith("--no-"):
                 assert re.search(rf"{re.escape(name)}(?![\w-])", shown), name
