@@ -62,6 +62,7 @@ CREDIT = 5
 """Chunks asked for ahead: the bytes of ten of 256 KiB, and two thirds faster (scripts/bench_transfer.py)."""
 _MAX_TRIES_PER_CHUNK = 4
 _POLL_MS = 200  # how soon a stop is noticed
+_LOOKS_WHILE_SILENT = 4  # how often a unit that works on something is asked for a sign of life
 
 _Reply_T = TypeVar("_Reply_T")
 
@@ -197,9 +198,38 @@ class UnitClient:
         """Ask how the unit is."""
         return self._ask(GetStatus(), StatusReply)
 
-    def arm(self, label: str = "", *, duration_s: float | None = None, timeout_s: float = 60.0) -> Armed:
-        """Make the unit ready for the next first edge; returns once it *is* ready."""
-        return self._ask(Arm(label=label, duration_s=duration_s), Armed, timeout_s=timeout_s)
+    def arm(self, label: str = "", *, duration_s: float | None = None, patience_s: float = 60.0) -> Armed:
+        """Make the unit ready for the next first edge; returns once it *is* ready.
+
+        A camera may take longer to start than a unit may be silent: meanwhile the unit is asked how it is,
+        and waited for while it answers.
+
+        Raises
+        ------
+        UnitTimeoutError
+            If nothing comes for ``timeout_s``, or the unit is not ready after ``patience_s``.
+        """
+        now_s = time.monotonic()
+        give_up_s = now_s + patience_s
+        silent_s = now_s + self.timeout_s
+        arming = self._send(Arm(label=label, duration_s=duration_s), silent_s)
+        while (now_s := time.monotonic()) < give_up_s:
+            look_s = now_s + self.timeout_s / _LOOKS_WHILE_SILENT
+            try:
+                reply_id, reply, _ = self._receive(min(look_s, silent_s), "arm")
+            except UnitTimeoutError:
+                if time.monotonic() >= silent_s:
+                    raise
+                self._send(GetStatus(), silent_s)
+                continue
+            if reply_id == arming:
+                return self._expect(reply, Armed, "arm")
+            silent_s = time.monotonic() + self.timeout_s
+            self.counts.stray_replies += not isinstance(reply, StatusReply)
+        raise UnitTimeoutError(
+            f"{self.address}: answers, but is not ready to record after {patience_s:g} s. "
+            "'bricktrack status' shows what it does, 'bricktrack disarm' brings it back"
+        )
 
     def disarm(self, *, timeout_s: float = 30.0) -> Disarmed:
         """Bring the unit back to idle without a run."""

@@ -16,6 +16,7 @@ from bricktrack_common.errors import ConfigError, ProtocolError, TransferError, 
 from bricktrack_common.key_files import make_key_pair
 from bricktrack_common.wire_messages import (
     MAX_CHUNK_BYTES,
+    Arm,
     Confirmed,
     Disarmed,
     GetStatus,
@@ -70,6 +71,54 @@ def test_each_request_gets_its_reply(runs):
         description = client.describe_run(RUN)
         assert [f.name for f in description.files] == ["manifest.json", "video.h264", "frames.msgpack"]
         assert isinstance(client.confirm(RUN, [f.sha256 for f in description.files]), Confirmed)
+
+
+class SlowToArm:
+    """Holds the answer to ``arm`` back until the unit was asked how it is so many times."""
+
+    def __init__(self, n_looks):
+        self.n_looks = n_looks
+        self.held = []
+
+    def __call__(self, request, messages):
+        if isinstance(request, Arm):
+            self.held = messages
+            return []
+        if isinstance(request, GetStatus):
+            self.n_looks -= 1
+            return [*messages, *self.held] if self.n_looks == 0 else messages
+        return messages
+
+
+def test_a_unit_that_arms_for_longer_than_it_may_be_silent_is_waited_for(runs):
+    with (
+        FakeUnit(runs, misbehave=SlowToArm(8)) as unit,  # two time-outs: four looks in each
+        UnitClient(unit.address, timeout_s=0.2) as client,
+    ):
+        start_s = time.monotonic()
+        assert client.arm("shake").run_id == RUN
+        assert time.monotonic() - start_s > 0.35
+        assert client.counts.stray_replies == 0
+
+
+def test_a_unit_that_dies_while_it_arms_is_given_up_as_soon_as_any_silent_one(runs):
+    with (
+        FakeUnit(runs, misbehave=lambda request, messages: []) as unit,
+        UnitClient(unit.address, timeout_s=0.3) as client,
+    ):
+        start_s = time.monotonic()
+        with pytest.raises(UnitTimeoutError, match="no answer to arm in time"):
+            client.arm("shake")
+        assert 0.25 < time.monotonic() - start_s < 10  # a busy machine's; it was a minute
+
+
+def test_a_unit_that_never_becomes_ready_is_not_waited_for_without_end(runs):
+    with (
+        FakeUnit(runs, misbehave=SlowToArm(-1)) as unit,
+        UnitClient(unit.address, timeout_s=2.0) as client,
+        pytest.raises(UnitTimeoutError, match="not ready to record after 0.7 s"),
+    ):
+        client.arm("shake", patience_s=0.7)
 
 
 def test_chunks_are_asked_for_ahead_and_make_up_the_file(runs):
