@@ -86,8 +86,8 @@ class Where:
         if self.scheduler is None and (self.send != "auto" or any(self.tls_files)):
             raise ConfigError("--send and --tls-... are for a cluster: give its --scheduler too")
 
-    def workers(self, n_runs: int) -> "Workers":
-        """Return who processes so many runs.
+    def workers(self, jobs: "list[RunJob]") -> "Workers":
+        """Return who processes these runs.
 
         Raises
         ------
@@ -98,7 +98,8 @@ class Where:
             from bricktrack_host.many_runs.local_processes import LocalProcesses
             from bricktrack_host.many_runs.memory import default_workers
 
-            return LocalProcesses(self.jobs or default_workers(n_runs), preload=[_PIPELINE])
+            n_workers = self.jobs or default_workers(job.recorded_s() for job in jobs)
+            return LocalProcesses(n_workers, preload=[_PIPELINE])
         from bricktrack_host.many_runs.dask_cluster import DaskCluster
 
         with err.status(f"asking {self.scheduler} for workers"):
@@ -205,7 +206,7 @@ def _process(todo: "list[tuple[RunJob, str]]", where: Where) -> int:
     from bricktrack_host.many_runs.workers import do_all
 
     handling: _Here | _Sent = _Here(todo) if where.scheduler is None else _Sent(todo, where.send)
-    workers = where.workers(len(todo))
+    workers = where.workers([job for job, _ in todo])
     bars: dict[int, StageBar] = {}
     n_failed = 0
     with _bars() as progress:

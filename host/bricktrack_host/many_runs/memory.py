@@ -1,21 +1,43 @@
 """How many runs this machine has processors and memory for."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
-RUN_MEMORY_MB = 800
-"""More than a run of 1080p and 45 s takes, simulated: 330 MB, and 9 MB a second for the smoother."""
+_RUN_MEMORY_MB = 500
+_RUN_MEMORY_MB_PER_S = 2
+"""More than simulated runs of 1080p took: 463 MB at 16 s, 600 MB at 180 s (``peak_memory_mb`` of the record)."""
 _MEMORY_SHARE = 0.8
 _CGROUP = Path("/sys/fs/cgroup")
 
 
-def default_workers(n_runs: int) -> int:
-    """Return how many runs to process at once: as many as there are processors and memory for."""
-    at_most = min(n_runs, usable_processors())
+def run_memory_mb(recorded_s: float) -> float:
+    """Return what processing a recording of this length takes at most, modules included."""
+    return _RUN_MEMORY_MB + _RUN_MEMORY_MB_PER_S * recorded_s
+
+
+def default_workers(recorded_s: Iterable[float]) -> int:
+    """Return how many of these recordings to process at once.
+
+    As many as there are processors, and as the memory holds even if the longest meet.
+
+    Parameters
+    ----------
+    recorded_s : iterable of float, s
+        The length of each.
+    """
+    longest_first = sorted(recorded_s, reverse=True)[: usable_processors()]
     available_mb = available_memory_mb()
-    if available_mb is not None:
-        at_most = min(at_most, int(_MEMORY_SHARE * available_mb / RUN_MEMORY_MB))
-    return max(at_most, 1)
+    if available_mb is None:
+        return max(len(longest_first), 1)
+    left_mb = _MEMORY_SHARE * available_mb
+    n_workers = 0
+    for length_s in longest_first:
+        left_mb -= run_memory_mb(length_s)
+        if left_mb < 0:
+            break
+        n_workers += 1
+    return max(n_workers, 1)
 
 
 def usable_processors() -> int:

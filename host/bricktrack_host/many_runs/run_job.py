@@ -3,6 +3,8 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from bricktrack_common.errors import RunFormatError
+from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.many_runs.one_at_a_time import alone_with
 from bricktrack_host.many_runs.processing_record import (
     ProcessingRecord,
@@ -44,6 +46,16 @@ class RunJob:
             If one was named and is not there.
         """
         return find_truth(self.run, self.truth)
+
+    def recorded_s(self) -> float:
+        """Return how long the recording is by its manifest; 0 where that does not tell."""
+        try:
+            manifest = read_manifest(self.run / MANIFEST_NAME)
+        except RunFormatError:  # said of this run alone, when it is read in earnest
+            return 0.0
+        if manifest.camera is None:
+            return 0.0
+        return manifest.quality.frames * manifest.camera.frame_duration_us * 1e-6
 
     def input_sha256(self) -> str:
         """Return a hash of everything that the results depend on; see `processing_record.input_sha256`."""
