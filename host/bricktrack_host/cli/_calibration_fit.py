@@ -163,9 +163,9 @@ def _print(fitted: RayCalibration, *, names: list[str], simulated: bool) -> None
     covered = model.is_covered(everywhere)
 
     table = Table(title="Calibration" + (" (simulated pictures)" if simulated else ""))
-    table.add_column("")
+    table.add_column("", no_wrap=True)
     for letter, name in zip(string.ascii_uppercase, names, strict=False):
-        table.add_column(f"plane {letter}: {name}", justify="right")
+        table.add_column(f"plane {letter}: {name}", justify="right", overflow="fold")
     rs = model.residuals
     sd_um = [1e3 * CHI_95 * model.point_sd_mm(everywhere, r.z_mm) for r in rs]
     table.add_row("depth, mm", *(f"{r.z_mm:.3f}" for r in rs))
@@ -174,13 +174,14 @@ def _print(fitted: RayCalibration, *, names: list[str], simulated: bool) -> None
     table.add_row("mean residual, um", *(f"{r.mean_um:.2f}" for r in rs))
     table.add_row("rms residual, um", *(f"{r.rms_um:.2f}" for r in rs))
     table.add_row("max residual, um", *(f"{r.max_um:.2f}" for r in rs))
-    table.add_row("rays known to (95 %) where dots are, um", *(f"{sd[covered].max():.2f}" for sd in sd_um))
+    table.add_row("rays known to at dots (95 %), um", *(f"{sd[covered].max():.2f}" for sd in sd_um))
     table.add_row("... over the whole picture, um", *(f"{sd.max():.2f}" for sd in sd_um))
     console.print(table)
 
     candidates = Table(title="Error at dots left out of the fit")
     for heading in ("model", "rms um", "max um", "noise over the picture um", ""):
-        candidates.add_column(heading, justify="left" if heading in ("model", "") else "right")
+        text = heading in ("model", "")
+        candidates.add_column(heading, justify="left" if text else "right", no_wrap=heading == "model")
     for c in choice.candidates:
         taken = (c.model, c.order, c.held) == (choice.model, choice.order, choice.held)
         candidates.add_row(

@@ -2,13 +2,44 @@
 
 import logging
 import sys
+from textwrap import fill
+from typing import Any
 
 import msgspec
 from rich.console import Console
 from rich.logging import RichHandler
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+
+class LineConsole(Console):
+    """A console whose long lines (``soft_wrap``) are broken between words on a terminal, and nowhere else.
+
+    What reads them from a pipe or a file gets each as one line; a terminal would break them within a word.
+    """
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print as `rich.console.Console.print` does."""
+        if options.get("soft_wrap") and self.is_terminal:
+            objects = tuple(self._wrapped(o) if isinstance(o, str) else o for o in objects)
+        super().print(*objects, **options)
+
+    def _wrapped(self, text: str) -> str:
+        return "\n".join(self._wrapped_line(line) for line in text.split("\n"))
+
+    def _wrapped_line(self, line: str) -> str:
+        if len(line) <= self.width:
+            return line
+        indent = " " * (len(line) - len(line.lstrip()))
+        return fill(
+            line,
+            max(self.width, 20),
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+
+
+out = LineConsole(highlight=False)
+err = LineConsole(stderr=True, highlight=False)
 
 
 def set_up_logging(verbosity: int) -> None:
@@ -19,7 +50,7 @@ def set_up_logging(verbosity: int) -> None:
 
 
 def say_error(text: str) -> None:
-    """Print an error as one red line, however long it is."""
+    """Print an error in red: one line, however long it is, which a terminal breaks between words."""
     line = " ".join(text.split())
     err.print(f"Error: {line}", style="bold red", markup=False, soft_wrap=True)
     sys.stderr.flush()

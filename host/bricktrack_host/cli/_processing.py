@@ -337,5 +337,7 @@ def say_truth(comparison: "TruthComparison | None") -> None:
     if comparison is None:
         return
     out.print(comparison_table(comparison))
+    out.print()
     if comparison.from_rest:
         out.print(comparison_table(comparison, from_rest=True))
+        out.print()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 _RUN_MEMORY_MB = 500
 _RUN_MEMORY_MB_PER_S = 2
-"""More than simulated runs of 1080p took: 463 MB at 16 s, 600 MB at 180 s (see ``peak_memory_mb`` of each)."""
+"""More than simulated runs of 1080p took: 463 MB at 16 s, 600 MB at 180 s (``peak_memory_mb`` of each)."""
 _MEMORY_SHARE = 0.8
 _CGROUP = Path("/sys/fs/cgroup")
 

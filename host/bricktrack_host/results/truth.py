@@ -316,7 +316,10 @@ def comparison_table(comparison: TruthComparison, *, from_rest: bool = False) ->
         title=f"Errors against simulated truth: {what}",
         title_justify="left",
         box=box.SIMPLE_HEAD,
+        show_edge=False,
         padding=(0, 1, 0, 0),
+        caption=None if from_rest else "95 %: the share of errors within what is stated to hold 95 %",
+        caption_justify="left",
     )
     table.add_column("rms; below: largest", no_wrap=True)
     table.add_column("n", justify="right")
