@@ -16,7 +16,7 @@ _MOVING = 9
 
 
 @compiled
-def _drive(run: RunArrays, k: int, R: Any, now: Any) -> None:
+def drive(run: RunArrays, k: int, R: Any, now: Any) -> None:
     """Add what the errors do to the state in the step from node ``k``."""
     h, half, dv = run.dt_s[k], run.R_half[k], run.dv_mps[k]
     for m in range(3):
@@ -53,7 +53,7 @@ def carry_forward(
         if k > 0 and run.dt_s[k - 1] > 0.0:
             transition(run, k - 1, R[k - 1], F)
             now[:_MOVING] = F @ now
-            _drive(run, k - 1, R[k - 1], now)
+            drive(run, k - 1, R[k - 1], now)
         predicted[k] = now
         if frame < len(at) and at[frame] == k:
             dy[frame] = own[frame] - H[frame] @ now
