@@ -14,12 +14,11 @@ from bricktrack_common.brick_model import DEFAULT_SHIFT_SD_PER_RADIUS, BrickMode
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.first_poses import FirstPoses
+from bricktrack_host.tracking.first_poses import FirstPoses, first_poses
 from bricktrack_host.tracking.frame_motion import calm_frames, carried_px, led_times_ns, motion_to_leds
 from bricktrack_host.tracking.led_profile import UNKNOWN_SHIFT_PER_RADIUS, predict_brick, shift_per_radius
-from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import OWN_SHARE, RefinedPoses, refine_poses
-from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
+from bricktrack_host.tracking.sweep_frames import frames_of, rms_px, sweep_frames
 from bricktrack_host.tracks import LedObservations
 
 _MIN_LEDS = 5  # four leave two degrees of freedom, which one collar and a false pose share too easily
@@ -110,10 +109,11 @@ def fit_collar(
     -----
     Gauss-Newton on the collar with the poses eliminated in every frame (variable projection).
     """
-    uv, cov = sweep_frames(
+    sweep = sweep_frames(
         observations, wanted="the LED profile needs", min_leds=_MIN_LEDS, min_frames=_MIN_FRAMES
     )
-    problem = _Problem(uv, cov, ray_model, brick_model)
+    uv = sweep.uv_px
+    problem = _Problem(sweep, ray_model, brick_model)
     everything = np.ones(len(uv), dtype=bool)
     collar = problem.solve(everything, start_mm)
     longest = max_collar_radii * float(brick_model.led_radii_mm.max())
@@ -182,15 +182,7 @@ def with_profile_of_run(
     uv_px = first.uv_px[frames]
     if motion is not None and frames.size:
         uv_px = uv_px - carried_px(motion, first, frames, ray_model, brick_model)
-    few = LedObservations(
-        sensor_timestamp_ns=observations.sensor_timestamp_ns[frames],
-        exposure_ns=observations.exposure_ns[frames],
-        uv_px=uv_px,
-        cov_px2=observations.cov_px2[frames],
-        area_px2=observations.area_px2[frames],
-        led_flags=observations.led_flags[frames],
-        frame_flags=observations.frame_flags[frames],
-    )
+    few = replace(frames_of(observations, frames), uv_px=uv_px)
     try:
         fit = fit_collar(few, ray_model, brick_model)
     except CalibrationError:
@@ -208,12 +200,16 @@ def with_profile_of_run(
 class _Problem:
     """Residuals of all frames for a collar, with the poses fitted; outliers are left out as they show."""
 
-    def __init__(self, uv: FloatArray, cov: FloatArray, ray_model: RayModel, brick_model: BrickModel) -> None:
-        self._uv, self._cov = uv.copy(), cov
+    def __init__(self, sweep: LedObservations, ray_model: RayModel, brick_model: BrickModel) -> None:
+        self._uv, self._cov = sweep.uv_px, sweep.cov_px2
         self._rays, self._brick = ray_model, brick_model
-        self._R, self._t = prsoi_starts(uv, ray_model, brick_model)
+        start = first_poses(self._uv, self._cov, sweep.sensor_timestamp_ns, ray_model, brick_model)
+        self._R, self._t = start.R_camera_brick, start.t_camera_brick_mm
         if not all_finite(self._R, 2).any():
-            raise CalibrationError("no frame has a start pose; the seen LEDs must not lie in one plane")
+            raise CalibrationError(
+                "no frame of the sweep has a pose to start from. Check the LEDs' positions and names in the "
+                "layout, and the calibration"
+            )
 
     def poses(self, collar_mm: float | None) -> RefinedPoses:
         """Return the poses and residuals for a collar; `None` is a sphere's outline."""

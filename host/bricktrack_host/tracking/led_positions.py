@@ -16,8 +16,8 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
 from bricktrack_common.rotations import skew
 from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.first_poses import first_poses
 from bricktrack_host.tracking.led_profile import collar_of, predict_brick
-from bricktrack_host.tracking.prsoi import prsoi_starts
 from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
 from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
 from bricktrack_host.tracks import LedObservations
@@ -106,10 +106,11 @@ def fit_positions(
             f"the layout '{brick_model.name}' has no [led_profile]; domes would pass for other places. "
             "Fit the profile first"
         )
-    uv, cov = sweep_frames(
+    sweep = sweep_frames(
         observations, wanted="LED positions need", min_leds=_MIN_LEDS, min_frames=_MIN_FRAMES
     )
-    problem = _Problem(uv, cov, ray_model, brick_model, tolerance_mm, with_collar)
+    uv = sweep.uv_px
+    problem = _Problem(sweep, ray_model, brick_model, tolerance_mm, with_collar)
     everything = np.ones(len(uv), dtype=np.bool_)
     solved = problem.solve(everything)
     positions = problem.positions_mm(solved)
@@ -170,23 +171,25 @@ class _Problem:
 
     def __init__(
         self,
-        uv: FloatArray,
-        cov: FloatArray,
+        sweep: LedObservations,
         ray_model: RayModel,
         brick_model: BrickModel,
         tolerance_mm: float,
         with_collar: bool,
     ) -> None:
-        self._uv, self._cov, self._rays, self._brick = uv, cov, ray_model, brick_model
+        self._uv, self._cov = sweep.uv_px, sweep.cov_px2
+        self._rays, self._brick = ray_model, brick_model
         self._nominal = brick_model.led_positions_mm
         self._free = free_directions(self._nominal)
         self._tolerance_mm = tolerance_mm
         n = self._free.shape[1]
         self.start = np.append(np.zeros(n), collar_of(brick_model) or 0.0)
         self._prior = np.diag(np.append(np.full(n, tolerance_mm**-2), 0.0 if with_collar else _HELD))
-        self._R, self._t = prsoi_starts(uv, ray_model, brick_model)
-        apart_px = np.nanstd(uv, axis=1).max()
+        apart_px = np.nanstd(self._uv, axis=1).max()
         self._px_per_mm = float(apart_px / np.std(self._nominal, axis=0).max())
+        loose = self._covariance(tolerance_mm)
+        start = first_poses(self._uv, loose, sweep.sensor_timestamp_ns, ray_model, brick_model)
+        self._R, self._t = start.R_camera_brick, start.t_camera_brick_mm
 
     def positions_mm(self, x: FloatArray) -> FloatArray:
         """Return the positions, shape (n_leds, 3)."""

@@ -1,8 +1,10 @@
 """Which frames and centroids of a sweep tell of the LEDs themselves: those with enough whole LEDs in them."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray
+from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_tracker import NOT_USED
@@ -11,8 +13,8 @@ from bricktrack_host.tracks import LedObservations
 
 def sweep_frames(
     observations: LedObservations, *, wanted: str, min_leds: int, min_frames: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the centroids of a sweep's useful frames, and their covariances.
+) -> LedObservations:
+    """Return a sweep's useful frames, with NaN centroids where an LED was not seen or is not whole.
 
     Parameters
     ----------
@@ -21,12 +23,6 @@ def sweep_frames(
         What is fitted to them and its verb, for the message: "the LED profile needs".
     min_leds, min_frames : int
         Whole LEDs that make a frame useful, and useful frames that make a sweep.
-
-    Returns
-    -------
-    uv_px : ndarray, shape (n, n_leds, 2), px
-        NaN where an LED was not seen, or not whole.
-    cov_px2 : ndarray, shape (n, n_leds, 2, 2), px^2
 
     Raises
     ------
@@ -40,7 +36,21 @@ def sweep_frames(
             f"{frames.size} frames with {min_leds} or more whole LEDs; {wanted} {min_frames}. "
             "Record a sweep with all LEDs in view."
         )
-    return np.where(used[..., None], observations.uv_px, np.nan)[frames], observations.cov_px2[frames]
+    whole = replace(observations, uv_px=np.where(used[..., None], observations.uv_px, np.nan))
+    return frames_of(whole, frames)
+
+
+def frames_of(observations: LedObservations, frames: IntArray) -> LedObservations:
+    """Return the observations of some frames alone."""
+    return LedObservations(
+        sensor_timestamp_ns=observations.sensor_timestamp_ns[frames],
+        exposure_ns=observations.exposure_ns[frames],
+        uv_px=observations.uv_px[frames],
+        cov_px2=observations.cov_px2[frames],
+        area_px2=observations.area_px2[frames],
+        led_flags=observations.led_flags[frames],
+        frame_flags=observations.frame_flags[frames],
+    )
 
 
 def rms_px(residual_px: FloatArray) -> float:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from led_scenes import leds_in_camera, lit_outline, polygon_centroid, random_poses, seven_leds
@@ -13,17 +15,17 @@ CAMERA = PinholeCamera()
 BRICK = seven_leds()
 
 
-def sweep(collar, *, n=12, sd=0.03, seed=1):
+def sweep(collar, *, n=12, sd=0.03, seed=1, brick=BRICK):
     """Centroids of true outlines, by no product code, with noise."""
     R, t = random_poses(n, seed=seed)
-    axes = np.einsum("nij,lj->nli", R, BRICK.led_axes)
+    axes = np.einsum("nij,lj->nli", R, brick.led_axes)
     uv = np.array(
         [
             [
                 polygon_centroid(lit_outline(c, a, radius=3.0, collar=collar, camera=CAMERA, n=120))[0]
                 for c, a in zip(centres, frame_axes, strict=True)
             ]
-            for centres, frame_axes in zip(leds_in_camera(R, t, BRICK), axes, strict=True)
+            for centres, frame_axes in zip(leds_in_camera(R, t, brick), axes, strict=True)
         ]
     )
     uv += np.random.default_rng(seed).normal(0, sd, uv.shape)
@@ -48,6 +50,13 @@ def test_the_collar_of_a_sweep_is_found(collar):
     assert fit.cross_validated_rms_px < 0.05
     assert fit.rms_without_px > 2 * fit.cross_validated_rms_px
     assert (fit.n_frames, fit.n_leds) == (12, 84)
+
+
+def test_leds_in_nearly_one_plane_tell_their_collar_too():
+    flat = replace(BRICK, led_positions_mm=BRICK.led_positions_mm * [1.0, 1.0, 0.05])
+    fit = fit_collar(sweep(0.9, brick=flat), CAMERA, flat)
+    assert fit.collar_mm == pytest.approx(0.9, abs=4 * fit.sd_mm + 0.02)
+    assert fit.n_frames == 12
 
 
 def test_too_few_frames_are_refused():

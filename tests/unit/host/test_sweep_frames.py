@@ -24,14 +24,14 @@ def scene():
 
 
 def test_frames_with_enough_whole_leds_are_taken_with_their_covariances():
-    uv, cov = sweep_frames(scene(), wanted="this needs", min_leds=3, min_frames=2)
-    assert np.isfinite(uv).all()
-    assert cov[:, 0, 0, 0].tolist() == [1.0, 4.0]  # the first frame and the last
+    sweep = sweep_frames(scene(), wanted="this needs", min_leds=3, min_frames=2)
+    assert np.isfinite(sweep.uv_px).all()
+    assert sweep.cov_px2[:, 0, 0, 0].tolist() == [1.0, 4.0]  # the first frame and the last
 
 
 def test_leds_that_are_not_whole_are_left_out_of_the_frames_that_are_taken():
-    uv, _ = sweep_frames(scene(), wanted="this needs", min_leds=2, min_frames=2)
-    assert np.isnan(uv[..., 0]).tolist() == [
+    sweep = sweep_frames(scene(), wanted="this needs", min_leds=2, min_frames=2)
+    assert np.isnan(sweep.uv_px[..., 0]).tolist() == [
         [False] * 3,
         [True, False, False],
         [False, True, False],
