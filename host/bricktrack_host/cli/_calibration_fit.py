@@ -20,6 +20,7 @@ from bricktrack_host.calibration.calibration_file import (
     save_calibration,
 )
 from bricktrack_host.calibration.dots.plane_pictures import merged_planes, n_left_out
+from bricktrack_host.calibration.rays.pixel_polynomials import COVERAGE_GRID, picture_grid
 from bricktrack_host.calibration.rays.ray_calibration import (
     ModelWish,
     OrderWish,
@@ -157,9 +158,7 @@ def _print(fitted: RayCalibration, *, names: list[str], simulated: bool) -> None
     """Print what was found and how good it is."""
     console = Console()
     model, choice = fitted.model, fitted.choice
-    mode = model.sensor_mode
-    u, v = np.meshgrid((np.arange(64) + 0.5) / 64 * mode.width, (np.arange(36) + 0.5) / 36 * mode.height)
-    everywhere = np.stack([u.ravel(), v.ravel()], axis=1) - 0.5
+    everywhere = picture_grid(model.sensor_mode, *COVERAGE_GRID)
     covered = model.is_covered(everywhere)
 
     table = Table(title="Calibration" + (" (simulated pictures)" if simulated else ""))

@@ -25,9 +25,7 @@ _PLOTS = (".png", ".pdf", ".svg")
 def align(
     runs: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="RUN", help="Processed runs, or their results folders.", show_default=False
-        ),
+        typer.Argument(metavar="RUN", help="Processed runs, or their results folders.", show_default=False),
     ] = None,
     poses: Annotated[
         Path | None,

@@ -71,10 +71,12 @@ def say_test(summary: "TestSummary") -> None:
     """Print what a test amounts to: components, loops, and what is wrong."""
     simulated = " (simulated)" if summary.simulated else ""
     agree = sum(unit.edges in ("agrees", "corrected") for unit in summary.units)
+    units = "1 unit" if len(summary.units) == 1 else f"{len(summary.units)} units"
+    solved = "1 assembly" if len(summary.assemblies) == 1 else f"{len(summary.assemblies)} assemblies"
     out.print(
-        f"{summary.name}{simulated}: {len(summary.units)} units, {agree} on the same samples, "
-        f"{len(summary.assemblies)} assemblies",
+        f"{summary.name}{simulated}: {units}, {agree} on the same samples, {solved}",
         markup=False,
+        soft_wrap=True,
     )
     for problem in summary.problems:
         out.print(f"  {problem}", style="yellow", markup=False, soft_wrap=True)

@@ -11,7 +11,7 @@ from bricktrack_host.calibration.dots.picture_region import ConvexRegion
 from bricktrack_host.calibration.rays.board_diagnostics import pixel_shape, print_error
 from bricktrack_host.calibration.rays.central_rays import CentralRays
 from bricktrack_host.calibration.rays.cross_validation import block_folds, left_out_errors_mm
-from bricktrack_host.calibration.rays.pixel_polynomials import picture_grid
+from bricktrack_host.calibration.rays.pixel_polynomials import COVERAGE_GRID, picture_grid
 from bricktrack_host.calibration.rays.ray_calibration import RayCalibration
 from bricktrack_host.reporting import calibration_figures as draw
 from bricktrack_host.reporting.embedding import embed_figure
@@ -49,7 +49,7 @@ class CalibrationEvidence:
     def covered_share(self) -> float:
         """Share of the picture that dots surround."""
         model = self.fitted.model
-        return float(np.mean(model.is_covered(picture_grid(model.sensor_mode, 65, 37))))
+        return float(np.mean(model.is_covered(picture_grid(model.sensor_mode, *COVERAGE_GRID))))
 
 
 def calibration_sections(evidence: CalibrationEvidence) -> tuple[list[Section], dict[str, Figure]]:

@@ -106,7 +106,7 @@ def test_a_test_is_combined_and_exported_by_commands(lab, tmp_path):
     runs = sorted(lab.glob("b7-*"))
     done = invoke("combine", *runs, "--name", "shake-12", "--fleet", lab / "fleet.toml")
     assert done.exit_code == 0, done.output
-    assert "shake-12 (simulated): 2 units, 2 on the same samples, 1 assemblies" in done.output
+    assert "shake-12 (simulated): 2 units, 2 on the same samples, 1 assembly" in done.output
     assert "b7-1 then b7-2" in done.output
     folder = lab / "tests" / "shake-12"
     summary = read_test(folder)

@@ -252,6 +252,10 @@ class InverseStart:
         return self._polynomial.values(scaled)
 
 
+COVERAGE_GRID = (65, 37)
+"""Columns and rows of pixels by which it is told how much of the picture dots surround."""
+
+
 def picture_grid(mode: SensorMode, columns: int = 33, rows: int = 19) -> FloatArray:
     """Return pixels, shape (rows * columns, 2), spread over the whole picture, border included."""
     u, v = np.meshgrid(np.linspace(0, mode.width - 1, columns), np.linspace(0, mode.height - 1, rows))
