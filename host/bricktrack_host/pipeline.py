@@ -14,7 +14,7 @@ from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import ConfigError, TrackingError
 from bricktrack_common.run_folder import Run, read_run
 from bricktrack_common.run_manifest import MANIFEST_NAME, TRUTH_NAME
-from bricktrack_host.calibration.calibration_file import load_calibration, require_match
+from bricktrack_host.calibration.calibration_file import load_calibration, rays_of_recording
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting.fusion_check import TwoFusions
 from bricktrack_host.reporting.report import ReportExtras, render_report
@@ -106,26 +106,28 @@ def process_run(
     stages = Stages(progress or Silent())
     with stages("read"):
         run = read_run(folder, verify_hashes=True)
-        rays = load_calibration(calibration)
+        calibrated = load_calibration(calibration)
         brick = load_brick_model(layout)
         frames = require_video(run)
+        rays = calibrated.ray_model
         if run.manifest.camera is not None:
-            require_match(rays, unit=run.manifest.unit, sensor_mode=run.manifest.camera.mode)
+            mode = run.manifest.camera.mode
+            rays = rays_of_recording(calibrated, unit=run.manifest.unit, sensor_mode=mode)
     problems = list(run.problems)
     pictures = RunPictures(run, frames)
     with stages(FIND, frames.n_frames):
-        observations = pictures.observe(rays.ray_model, brick, settings.segmentation, stages.progress)
+        observations = pictures.observe(rays, brick, settings.segmentation, stages.progress)
     problems += pictures.problems()
     with stages("solve poses"):
-        first = start_poses(observations, rays.ray_model, brick, form=settings.prsoi_form)
+        first = start_poses(observations, rays, brick, form=settings.prsoi_form)
         brick = with_profile_of_run(
-            observations, first, rays.ray_model, brick, rolling_shutter=settings.rolling_shutter
+            observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
         )
         observations = with_measured_noise(
-            observations, first, rays.ray_model, brick, rolling_shutter=settings.rolling_shutter
+            observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
         )
         optical = solve_poses(
-            observations, rays.ray_model, brick, rolling_shutter=settings.rolling_shutter, first=first
+            observations, rays, brick, rolling_shutter=settings.rolling_shutter, first=first
         )
     _require_poses(optical, run, brick)
     with stages("align clocks"):
@@ -136,10 +138,10 @@ def process_run(
         rest = rest_pose(optical, inertial, problems)
     with stages("fuse"):
         if settings.rolling_shutter:
-            optical = retime(observations, first, optical, inertial, rays.ray_model, brick)
+            optical = retime(observations, first, optical, inertial, rays, brick)
             _require_poses(optical, run, brick)
         grid = output_grid(optical, inertial, edge_fit)
-        seen = (observations, rays.ray_model) if settings.rolling_shutter else None
+        seen = (observations, rays) if settings.rolling_shutter else None
         fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
         optical, fused = with_unsure_times(optical, fused, time_sd_ns)
     result = RunResult(
@@ -153,7 +155,7 @@ def process_run(
         imu=imu,
         rest=rest,
         alignment=alignment_details(inertial, fusion, optical),
-        calibration=calibration_details(rays),
+        calibration=calibration_details(calibrated),
         problems=tuple(problems),
         provenance=Provenance(
             manifest_sha256=sha256_file(folder / MANIFEST_NAME),
@@ -165,7 +167,7 @@ def process_run(
         timings_s=stages.seconds,
     )
     results_folder = output or folder / RESULTS_FOLDER
-    overlays, covered = pictures.overlays(observations, optical), calibration_picture(rays)
+    overlays, covered = pictures.overlays(observations, optical), calibration_picture(calibrated)
 
     def report() -> tuple[str, TruthComparison | None]:
         comparison, two = _compare(result, folder, truth), None

@@ -28,12 +28,16 @@ def processed(tmp_path_factory):
     calibration, layout = folder / "calibration.json", folder / "layout.toml"
     calibrate.fit(calibration, "sample", rig=sample / "rig.toml", target="32x18", images_dir=sample)
     leds(folder / "sample_static", calibration, sample / "layout.toml", layout)
-    return layout, process_run(
-        folder / "sample_motion",
-        calibration=calibration,
-        layout=layout,
-        truth=sample / "truth" / "motion_dense.csv",
+    moved, rested = (
+        process_run(
+            folder / f"sample_{name}",
+            calibration=calibration,
+            layout=layout,
+            truth=sample / "truth" / truth,
+        )
+        for name, truth in (("motion", "motion_dense.csv"), ("static", "static_poses.csv"))
     )
+    return layout, moved, rested
 
 
 def test_the_fitted_collar_is_near_the_drawn_one(processed):
@@ -55,3 +59,11 @@ def test_errors_are_below_what_plain_centroids_reach(processed):
         x, y, z, *rotation = groups[group]
         assert x < 0.017 and y < 0.006 and z < 0.142
         assert np.linalg.norm(rotation) < 0.12
+
+
+def test_pictures_whose_rows_are_of_one_instant_are_solved_alone(processed):
+    # "static", the frames' poses 6 mm apart: "+ collar", video, the better of both sweeps (README)
+    group = next(g for g in processed[2].truth.groups if (g.source, g.group) == ("optical", "all"))
+    assert group.n == 20
+    assert (np.array(group.rms[:3]) < [0.013, 0.002, 0.100]).all()
+    assert np.linalg.norm(group.rms[3:]) < 0.06

@@ -5,6 +5,7 @@ it was made, how, when and by which version, what the fit left, how well it pred
 dots were, and the covariance of its coefficients.
 """
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib import metadata
@@ -375,6 +376,22 @@ def require_match(calibration: Calibration, *, unit: str | None, sensor_mode: Se
             f"the calibration is for sensor mode {_describe(calibration.sensor_mode)}, the recording was "
             f"made in {_describe(sensor_mode)}; calibrate in the mode that is recorded"
         )
+
+
+def rays_of_recording(
+    calibration: Calibration, *, unit: str | None, sensor_mode: SensorMode
+) -> CentralRays | TwoPlaneIrt:
+    """Return the calibrated rays for a recording, its rows read as fast as it says.
+
+    The same field may be read out faster or slower, or all rows at once: the line time is the recording's.
+
+    Raises
+    ------
+    CalibrationError
+        As `require_match`.
+    """
+    require_match(calibration, unit=unit, sensor_mode=sensor_mode)
+    return replace(calibration.ray_model, sensor_mode=sensor_mode)
 
 
 def _describe(mode: SensorMode) -> str:

@@ -54,7 +54,7 @@ def leds(
 
     from bricktrack_common.brick_model import ProfileEntry, load_brick_model
     from bricktrack_common.run_folder import read_run
-    from bricktrack_host.calibration.calibration_file import load_calibration, require_match
+    from bricktrack_host.calibration.calibration_file import load_calibration, rays_of_recording
     from bricktrack_host.cli._console import out
     from bricktrack_host.cli.process import stage_bar
     from bricktrack_host.pipeline import observe_run
@@ -64,21 +64,23 @@ def leds(
     brick = load_brick_model(layout)
     if brick.led_profile is not None and not positions:
         raise ConfigError(f"{layout}: has a [led_profile] already; take it out to fit another")
-    rays = load_calibration(calibration)
+    calibrated = load_calibration(calibration)
+    rays = calibrated.ray_model
     recording = read_run(run, verify_hashes=True)
     if recording.manifest.camera is not None:
-        require_match(rays, unit=recording.manifest.unit, sensor_mode=recording.manifest.camera.mode)
+        mode = recording.manifest.camera.mode
+        rays = rays_of_recording(calibrated, unit=recording.manifest.unit, sensor_mode=mode)
     with stage_bar(run.name) as bar:
-        observations, problems = observe_run(recording, rays.ray_model, brick, progress=bar)
+        observations, problems = observe_run(recording, rays, brick, progress=bar)
     for problem in problems:
         out.print(problem, style="yellow", markup=False)
     simulated = " (simulated)" if recording.manifest.simulated else ""
     text = layout.read_text(encoding="utf-8").rstrip()
     places: PositionsFit | None = None
     if brick.led_profile is not None:
-        places = fit_positions(observations, rays.ray_model, brick, tolerance_mm=tolerance_mm)
+        places = fit_positions(observations, rays, brick, tolerance_mm=tolerance_mm)
     else:
-        fit = fit_collar(observations, rays.ray_model, brick)
+        fit = fit_collar(observations, rays, brick)
         if positions:
             start = replace(
                 brick,
@@ -86,11 +88,9 @@ def leds(
                     collar_mm=fit.collar_mm, source="being fitted", shift_sd_per_radius=LEAST_SHIFT_SD
                 ),
             )
-            places = fit_positions(
-                observations, rays.ray_model, start, tolerance_mm=tolerance_mm, with_collar=True
-            )
+            places = fit_positions(observations, rays, start, tolerance_mm=tolerance_mm, with_collar=True)
             moved = replace(brick, led_positions_mm=places.positions_mm)
-            fit = fit_collar(observations, rays.ray_model, moved, start_mm=places.collar_mm)
+            fit = fit_collar(observations, rays, moved, start_mm=places.collar_mm)
             fit = replace(fit, sd_mm=max(fit.sd_mm, places.collar_sd_mm))
         _show_collar(fit, simulated)
         if not fit.is_believable:

@@ -15,6 +15,7 @@ from bricktrack_host.calibration.calibration_file import (
     TargetImage,
     load_calibration,
     make_calibration,
+    rays_of_recording,
     require_match,
     save_calibration,
 )
@@ -215,6 +216,17 @@ def test_a_calibration_of_another_unit_or_mode_is_refused(calibration):
     )
     with pytest.raises(CalibrationError, match="imx219-1920x1080-crop.*'binned'"):
         require_match(calibration, unit=None, sensor_mode=binned)
+
+
+@pytest.mark.parametrize("line_time_ns", [0.0, 25_000.0])
+def test_rows_are_read_as_fast_as_the_recording_says(calibration, line_time_ns):
+    mode = msgspec.structs.replace(IMX219_1080P, line_time_ns=line_time_ns)
+    rays = rays_of_recording(calibration, unit="brick-1", sensor_mode=mode)
+    assert rays.sensor_mode.row_delay_ns(100.0) == 100 * line_time_ns
+    points = np.array([[3.0, -2.0, 130.0], [-20.0, 15.0, 110.0]])
+    np.testing.assert_array_equal(rays.project(points).uv_px, calibration.ray_model.project(points).uv_px)
+    with pytest.raises(CalibrationError, match="brick-2"):
+        rays_of_recording(calibration, unit="brick-2", sensor_mode=mode)
 
 
 def test_a_folder_that_is_not_there_is_named(calibration, tmp_path):
