@@ -121,7 +121,17 @@ def _of_areas(area_px2: FloatArray, predicted_px2: FloatArray, kept: BoolArray) 
     rows = np.arange(len(ratio))
     common = 0.5 * (ordered[rows, (n - 1) // 2] + ordered[rows, n // 2])
     common = np.clip(np.where(known.any(axis=1), common, 0.0), -_COMMON_AREA, _COMMON_AREA)
-    z = (ratio - common[:, None]) / _AREA_SD
-    own = (1 - _AREA_OTHER) * np.exp(-0.5 * z**2) / (np.sqrt(2 * np.pi) * _AREA_SD)
-    gain = np.log((own + _AREA_OTHER / _LOG_AREAS) * _LOG_AREAS)
+    gain = log_area_ratio(ratio - common[:, None])
     return np.asarray(np.where(known, gain, 0.0).sum(axis=1))
+
+
+def log_area_ratio(log_ratio: FloatArray) -> FloatArray:
+    """Return how much likelier areas are an LED's than another light's, as logarithms.
+
+    Parameters
+    ----------
+    log_ratio : ndarray
+        Logarithm of the area over the predicted one, less what all LEDs of the picture have in common.
+    """
+    own = (1 - _AREA_OTHER) * np.exp(-0.5 * (log_ratio / _AREA_SD) ** 2) / (np.sqrt(2 * np.pi) * _AREA_SD)
+    return np.asarray(np.log((own + _AREA_OTHER / _LOG_AREAS) * _LOG_AREAS))

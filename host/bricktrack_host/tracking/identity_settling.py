@@ -11,6 +11,7 @@ from scipy.ndimage import maximum_filter, median_filter
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.identity_motion import RunMotion, turn_between, unknown_motion
+from bricktrack_host.tracking.identity_newcomers import leave_out_newcomers
 from bricktrack_host.tracking.pattern import assign_predicted
 from bricktrack_host.tracking.refine import LedMotion
 from bricktrack_host.tracking.run_identities import (
@@ -23,6 +24,7 @@ from bricktrack_host.tracking.run_identities import (
 from bricktrack_host.tracking.verification import MIN_INLIERS, LedLights, Verified, motion_of
 
 _LEAST_GATE_PX = 0.5  # what calibration and profile may leave, beside centroid noise
+_LEAST_USUAL_PX = 0.1  # usual residuals of few LEDs are small by chance
 _LEAST_TURN_RAD = 0.01  # off the cubic through its neighbours; a 2 degree shake at 6 Hz is 0.011 off
 _MOST_TURN_RAD = 0.1  # no shaken brick's, where its run is smooth
 _SAME_TURN = 0.7  # share of a turn that is left without any one LED where it is the brick that turned
@@ -34,7 +36,8 @@ def settle(run: RunIdentities) -> None:
     """Judge every frame by how the run moves; what then does not fit is refused."""
     _refuse_lone(run)
     had = run.n_found > 0
-    _settle_rounds(run)
+    usual_px = _settle_rounds(run)
+    leave_out_newcomers(run, usual_px)
     n_found = run.n_found
     # What is left beside frames that were refused, with no neighbours to judge it by, may be the culprit.
     beside = maximum_filter((had & (n_found == 0)).astype(np.int64), 5, mode="constant") > 0
@@ -51,12 +54,14 @@ def _refuse_lone(run: RunIdentities) -> None:
     run.refuse(known[lone])
 
 
-def _settle_rounds(run: RunIdentities) -> None:
+def _settle_rounds(run: RunIdentities) -> FloatArray:
+    """Return what residuals scatter by about each frame, px."""
+    usual_px = np.full(len(run.blobs), run.gate_px / SUSPECT)
     usual_gate = np.full(len(run.blobs), run.gate_px)
     for round_ in range(_WARM_ROUNDS + _SETTLE_ROUNDS):
         frames = run.known_frames()
         if frames.size < NEAR_FRAMES:
-            return
+            break
         before = run.found.blob_of_led.copy()
         assigned, lights = before[frames], run.lights_of(frames)
         motion = run.motion()
@@ -79,12 +84,14 @@ def _settle_rounds(run: RunIdentities) -> None:
             good[bad[fits]] = True
         run.take(frames, assigned, verified, good)
         tight_px = np.interp(np.arange(len(run.blobs)), frames, tight)
+        usual_px = np.interp(np.arange(len(run.blobs)), frames, np.maximum(usual, _LEAST_USUAL_PX))
         _leave_twins(run, tight_px)
         limit_rad = _mend_lurches(run, tight_px)
         run.refuse(frames[~good])
         _identify_again(run, tight_px, limit_rad)
         if (run.found.blob_of_led == before).all():
-            return
+            break
+    return usual_px
 
 
 def _leave_twins(run: RunIdentities, tight_px: FloatArray) -> None:
