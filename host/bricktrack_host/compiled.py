@@ -57,7 +57,15 @@ def compiled_in_place(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return _kept(function, _nrt=False)
 
 
-def _kept(function: Callable[_P, _R], **options: bool) -> Callable[_P, _R]:
+def compiled_sums(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Return a function compiled as by `compiled_in_place`, whose products may be rounded with their sums.
+
+    One rounding instead of two: faster, and not less exact. NaN and infinity stay what they are.
+    """
+    return _kept(function, _nrt=False, fastmath={"contract"})
+
+
+def _kept(function: Callable[_P, _R], **options: bool | set[str]) -> Callable[_P, _R]:
     folder = _folder(function.__code__.co_filename)
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
     made: Any = njit(cache=True, nogil=True, error_model="numpy", **options)  # type: ignore[call-overload]

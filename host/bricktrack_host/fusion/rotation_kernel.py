@@ -1,89 +1,85 @@
-"""Rotations inside compiled loops: one at a time, written in place."""
+"""Rotations inside compiled loops: one at a time, as nine numbers row by row, or written in place."""
 
 from typing import Any
 
 import numpy as np
 
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled_in_place
 
 
-@compiled
-def write_rotation(v: Any, out: Any) -> None:
-    """Write Exp of a rotation vector."""
-    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+@compiled_in_place
+def rotation_of(x: float, y: float, z: float) -> Any:
+    """Return Exp of a rotation vector, row by row."""
+    a2 = x * x + y * y + z * z
     if a2 < 0.01:  # the next terms are below 1e-17
         s = 1.0 - a2 / 6.0 * (1.0 - a2 / 20.0 * (1.0 - a2 / 42.0 * (1.0 - a2 / 72.0)))
         c = 0.5 - a2 / 24.0 * (1.0 - a2 / 30.0 * (1.0 - a2 / 56.0 * (1.0 - a2 / 90.0)))
     else:
         a = np.sqrt(a2)
         s, c = np.sin(a) / a, (1.0 - np.cos(a)) / a2
+    rest = 1.0 - c * a2
+    return (
+        c * x * x + rest, c * x * y - s * z, c * x * z + s * y,
+        c * y * x + s * z, c * y * y + rest, c * y * z - s * x,
+        c * z * x - s * y, c * z * y + s * x, c * z * z + rest,
+    )  # fmt: skip
+
+
+@compiled_in_place
+def write_rotation(v: Any, out: Any) -> None:
+    """Write Exp of a rotation vector."""
+    E = rotation_of(v[0], v[1], v[2])
     for i in range(3):
         for j in range(3):
-            out[i, j] = c * v[i] * v[j]
-        out[i, i] += 1.0 - c * a2
-    out[0, 1] -= s * v[2]
-    out[0, 2] += s * v[1]
-    out[1, 0] += s * v[2]
-    out[1, 2] -= s * v[0]
-    out[2, 0] -= s * v[1]
-    out[2, 1] += s * v[0]
+            out[i, j] = E[3 * i + j]
 
 
-@compiled
+@compiled_in_place
+def _columns(A: Any, i: int, B: Any, j: int) -> float:
+    """Return the product of column i of A and column j of B: an element of A^T B."""
+    return float(A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j])
+
+
+@compiled_in_place
 def write_rotation_vector(A: Any, B: Any, out: Any) -> None:
     """Write Log of A^T B, by the quaternion: good for every angle."""
-    C = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            C[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
-    trace = C[0, 0] + C[1, 1] + C[2, 2]
-    q = np.zeros(4)
-    i = 0
-    if trace > 0:
-        q[0] = 1 + trace
-        q[1], q[2], q[3] = C[2, 1] - C[1, 2], C[0, 2] - C[2, 0], C[1, 0] - C[0, 1]
+    c00, c11, c22 = _columns(A, 0, B, 0), _columns(A, 1, B, 1), _columns(A, 2, B, 2)
+    c01, c10 = _columns(A, 0, B, 1), _columns(A, 1, B, 0)
+    c02, c20 = _columns(A, 0, B, 2), _columns(A, 2, B, 0)
+    c12, c21 = _columns(A, 1, B, 2), _columns(A, 2, B, 1)
+    if c00 + c11 + c22 > 0:
+        w, x, y, z = 1 + c00 + c11 + c22, c21 - c12, c02 - c20, c10 - c01
+    elif c00 >= c11 and c00 >= c22:
+        w, x, y, z = c21 - c12, 1 + c00 - c11 - c22, c01 + c10, c02 + c20
+    elif c11 >= c22:
+        w, x, y, z = c02 - c20, c01 + c10, 1 + c11 - c22 - c00, c12 + c21
     else:
-        if C[1, 1] > C[0, 0]:
-            i = 1
-        if C[2, 2] > C[i, i]:
-            i = 2
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q[1 + i] = 1 + C[i, i] - C[j, j] - C[k, k]
-        q[0] = C[k, j] - C[j, k]
-        q[1 + j], q[1 + k] = C[j, i] + C[i, j], C[k, i] + C[i, k]
-    norm = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    sign = 1.0 if q[0] >= 0 else -1.0
-    s = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2) / norm
-    w = sign * q[0] / norm
-    gain = 2.0 + s * s / 3.0 if s < 1e-4 else 2.0 * np.arctan2(s, w) / s
+        w, x, y, z = c10 - c01, c02 + c20, c12 + c21, 1 + c22 - c00 - c11
+    norm = np.sqrt(w * w + x * x + y * y + z * z)
+    s = np.sqrt(x * x + y * y + z * z) / norm
+    gain = 2.0 + s * s / 3.0 if s < 1e-4 else 2.0 * np.arctan2(s, abs(w) / norm) / s
+    gain = (gain if w >= 0 else -gain) / norm
+    out[0], out[1], out[2] = gain * x, gain * y, gain * z
+
+
+@compiled_in_place
+def _times(R: Any, E: Any) -> None:
+    """Replace R by R E, the latter given row by row."""
     for i in range(3):
-        out[i] = gain * sign * q[1 + i] / norm
+        a, b, c = R[i, 0], R[i, 1], R[i, 2]
+        for j in range(3):
+            R[i, j] = a * E[j] + b * E[3 + j] + c * E[6 + j]
 
 
-@compiled
+@compiled_in_place
 def turn_by(R: Any, v: Any) -> None:
     """Replace R by R Exp(v)."""
-    E = np.empty((3, 3))
-    write_rotation(v, E)
-    row = np.empty(3)
-    for i in range(3):
-        for j in range(3):
-            row[j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
-        for j in range(3):
-            R[i, j] = row[j]
+    _times(R, rotation_of(v[0], v[1], v[2]))
 
 
-@compiled
+@compiled_in_place
 def orthonormalise(R: Any) -> None:
     """Take one Newton step back to a rotation."""
-    S = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            S[i, j] = -0.5 * (R[0, i] * R[0, j] + R[1, i] * R[1, j] + R[2, i] * R[2, j])
-        S[i, i] += 1.5
-    row = np.empty(3)
-    for i in range(3):
-        for j in range(3):
-            row[j] = R[i, 0] * S[0, j] + R[i, 1] * S[1, j] + R[i, 2] * S[2, j]
-        for j in range(3):
-            R[i, j] = row[j]
+    xx, yy, zz = _columns(R, 0, R, 0), _columns(R, 1, R, 1), _columns(R, 2, R, 2)
+    xy, xz, yz = -0.5 * _columns(R, 0, R, 1), -0.5 * _columns(R, 0, R, 2), -0.5 * _columns(R, 1, R, 2)
+    _times(R, (1.5 - 0.5 * xx, xy, xz, xy, 1.5 - 0.5 * yy, yz, xz, yz, 1.5 - 0.5 * zz))

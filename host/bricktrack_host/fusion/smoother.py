@@ -7,8 +7,6 @@ derivative. Arrays put time first and the runs of the batch second; a run shorte
 with empty steps. The loops over time are compiled (`smoother_kernel`, `smoother_backward`).
 """
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,12 +15,13 @@ from numpy.typing import NDArray
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
+from bricktrack_host.fusion.covariance_kernel import SIZE
 from bricktrack_host.fusion.observation_kernel import LedArrays
 from bricktrack_host.fusion.smoother_backward import backward_pass
-from bricktrack_host.fusion.smoother_kernel import CHUNK, RunArrays, forward_pass, states_before_frames
+from bricktrack_host.fusion.smoother_kernel import CHUNK, forward_pass, states_before_frames
+from bricktrack_host.fusion.transition_kernel import RunArrays
 
 T = TypeVar("T", bound=np.generic)
-_THREADS = min(4, os.cpu_count() or 1)
 N_STATES = 22
 ATT, POS, VEL, BG, BA, GRAV = (slice(3 * i, 3 * i + 3) for i in range(6))
 TAU, SKEW, LAG, LOSS = 18, 19, 20, 21
@@ -204,23 +203,6 @@ def residuals_of(problem: Problem, state: State, at: IntArray, b: int) -> tuple[
     return np.concatenate([turn, problem.p_seen_m[at, b] - p], axis=-1), H
 
 
-def sensitivities(problem: Problem) -> FloatArray:
-    """Return, in body axes, what changes dv: attitude, accelerometer bias, lag, loss; then the same for dp.
-
-    Shape (K - 1, B, 6, 8): rows dv, dp; columns theta (3), ba (3), lag, loss.
-    """
-    dt = problem.dt_s[..., None, None]
-    out = np.zeros((*problem.dt_s.shape, 6, 8))
-    rate = problem.R_half @ np.stack([problem.f_rate_mps3, -problem.f_curve_mps4], axis=-1)
-    out[..., :3, :3] = -skew(problem.dv_mps)
-    out[..., 3:, :3] = -skew(problem.dp_m)
-    out[..., :3, 3:6] = -problem.R_half * dt
-    out[..., 3:, 3:6] = -problem.R_half * dt**2 / 2
-    out[..., :3, 6:] = rate * dt
-    out[..., 3:, 6:] = rate * dt**2 / 2
-    return out
-
-
 class Filter:
     """The forward pass over a batch; `smooth` runs back over it.
 
@@ -243,7 +225,7 @@ class Filter:
         self.runs = [_arrays_of(problem, b) for b in range(n_runs)]
         n_kept = -(-n_nodes // CHUNK)
         R, x = np.empty((n_runs, n_kept, 3, 3)), np.empty((n_runs, n_kept, N_STATES))
-        P = np.empty((n_runs, n_kept, N_STATES, N_STATES))
+        P = np.empty((n_runs, n_kept, SIZE))
         self._before = R, x, P
         # One run after the other in memory; seen with time first, as everything else.
         self.nis = np.full((n_runs, n_nodes), np.nan).T
@@ -255,10 +237,6 @@ class Filter:
                 run, gyro_var, acc_var, *_start_of(problem, b), self.nis.T[b], self.inflation.T[b],
                 R[b], x[b], P[b],
             )  # fmt: skip
-
-    def attitudes(self) -> FloatArray:
-        """Return the filter's attitudes, each knowing only the past, shape (K, B, 3, 3)."""
-        return self.forward().state.R
 
     def _noise_of(self, b: int) -> tuple[FloatArray, FloatArray]:
         pr = self._problem
@@ -331,20 +309,17 @@ def score_noise(problem: Problem, gyro_var: FloatArray, acc_var: FloatArray) -> 
     n_runs, n_choices = gyro_var.shape[:2]
     log_likelihood = np.zeros((n_runs, n_choices))
     last = np.zeros((n_runs, n_choices, N_STATES))
-    runs = [_arrays_of(problem, b) for b in range(n_runs)]
-
-    def score(which: tuple[int, int]) -> None:
-        b, i = which
-        R, x, P = _start_of(problem, b)
-        log_likelihood[b, i] = forward_pass(
-            runs[b], np.ascontiguousarray(gyro_var[b, i]), np.ascontiguousarray(acc_var[b, i]), R, x, P,
-            np.empty(len(problem.has_frame)), np.empty(len(problem.has_frame)),
-            np.empty((0, 3, 3)), np.empty((0, N_STATES)), np.empty((0, N_STATES, N_STATES)),
-        )  # fmt: skip
-        last[b, i] = x
-
-    with ThreadPoolExecutor(_THREADS) as threads:  # compiled loops hold no lock
-        list(threads.map(score, np.ndindex(n_runs, n_choices)))
+    n_nodes = len(problem.has_frame)
+    nis, inflation = np.empty(n_nodes), np.empty(n_nodes)
+    nothing = np.empty((0, 3, 3)), np.empty((0, N_STATES)), np.empty((0, SIZE))
+    for b in range(n_runs):
+        run = _arrays_of(problem, b)
+        for i in range(n_choices):
+            R, x, P = _start_of(problem, b)
+            log_likelihood[b, i] = forward_pass(
+                run, gyro_var[b, i], acc_var[b, i], R, x, P, nis, inflation, *nothing
+            )
+            last[b, i] = x
     return log_likelihood, last
 
 
