@@ -98,11 +98,16 @@ def input_sha256(run: Path, files: dict[str, Path | None], settings: Any) -> str
         parts = {
             "manifest": sha256_file(run / MANIFEST_NAME),
             "sizes": {f.name: _size(run / f.name) for f in manifest.files},
-            "files": {what: None if path is None else sha256_file(path) for what, path in files.items()},
+            "files": {what: None if path is None else _sha256_of(what, path) for what, path in files.items()},
             "settings": msgspec.to_builtins(settings),
             "code": code_sha256(),
         }
     return hashlib.sha256(msgspec.json.encode(parts, order="sorted")).hexdigest()
+
+
+def _sha256_of(what: str, path: Path) -> str:
+    with storage_errors(path, f"It is to hold the run's {what}; name another with --{what} or in fleet.toml"):
+        return sha256_file(path)
 
 
 def _size(path: Path) -> int | None:

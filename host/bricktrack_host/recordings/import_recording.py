@@ -101,7 +101,7 @@ def import_recording(recording: Recording, runs_folder: Path) -> Imported:
         If the run exists already, or cannot be written.
     """
     run_id = "_".join(part for part in (recording.unit, recording.label) if part)
-    if not is_run_id(run_id):
+    if not (is_run_id(recording.unit) and is_run_id(run_id)):
         raise ConfigError(
             f"run id {run_id!r}: unit and label may hold letters, digits, '-', '_' and '.', and begin with a "
             "letter or digit"

@@ -63,6 +63,8 @@ def load_video(path: Path) -> LooseVideo:
             head = file.read(4)
     except OSError as e:
         raise VideoError(f"{path}: {e.strerror or e}") from e
+    if not head:
+        raise VideoError(f"{path}: the file is empty; expected an H.264 video. Copy it again")
     bare = head.startswith(_START_CODES)
     width, height, color_range = _probe(path, bare=bare)
     container_us = None
@@ -95,7 +97,9 @@ def _probe(path: Path, *, bare: bool) -> tuple[int, int, str]:
             known = "limited" if codec.color_range == 1 else "unknown"
             return codec.width, codec.height, "full" if full else known
     except av.error.FFmpegError as e:
-        raise VideoError(f"{path}: no video that can be read: {e.strerror}") from e
+        raise VideoError(
+            f"{path}: no video that can be read: {e.strerror}. Expected H.264: bare (.h264), or in MP4 or MKV"
+        ) from e
 
 
 def _repack(path: Path) -> tuple[bytes, list[AccessUnit], IntArray]:

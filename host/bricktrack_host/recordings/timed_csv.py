@@ -38,6 +38,7 @@ class TimedCsv:
                 continue
             if not header:
                 header = [c.strip() for c in row]
+                refuse_other_separator(path, header)
                 continue
             if len(row) != len(header):
                 raise RunFormatError(
@@ -45,7 +46,7 @@ class TimedCsv:
                 )
             rows.append((reader.line_num, row))
         if not rows:
-            raise RunFormatError(f"{path}: no rows below a first line of column names")
+            raise RunFormatError(f"{path}: no rows; expected a first line of column names, and rows below it")
         return cls(path, header, rows)
 
     def columns(self, names: Sequence[str], *, expected: str) -> tuple[IntArray, FloatArray]:
@@ -80,7 +81,8 @@ class TimedCsv:
             t_ns[i] = int(row[column])
             if i and t_ns[i] <= t_ns[i - 1]:
                 raise RunFormatError(
-                    f"{self.path}: line {line}: t_ns {row[column].strip()} does not come after the one before"
+                    f"{self.path}: line {line}: t_ns {row[column].strip()} does not come after the one "
+                    "before; rows must stand in the order of time, each once"
                 )
         return t_ns
 
@@ -91,6 +93,24 @@ class TimedCsv:
             return float(text)
         except ValueError as e:
             raise RunFormatError(f"{self.path}: line {line}: {text[:40]!r} is no number") from e
+
+
+def refuse_other_separator(path: Path, header: list[str]) -> None:
+    """Refuse a table whose fields are parted by semicolons or tabs, as spreadsheets of some countries write.
+
+    Raises
+    ------
+    RunFormatError
+        If the first line is one field that holds such separators.
+    """
+    if len(header) != 1:
+        return
+    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+        if separator in header[0]:
+            raise RunFormatError(
+                f"{path}: fields are parted by {name}. Write it again with commas between the fields, and "
+                "points in the numbers"
+            )
 
 
 def read_text(path: Path, error: type[VideoError] | type[RunFormatError]) -> str:

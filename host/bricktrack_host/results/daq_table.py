@@ -9,6 +9,7 @@ import pyarrow.csv
 
 from bricktrack_common.arrays import IntArray
 from bricktrack_common.errors import RunFormatError
+from bricktrack_host.recordings.timed_csv import refuse_other_separator
 
 MAX_SAMPLE = 2**53  # whole numbers in a float64 column end here
 
@@ -32,6 +33,8 @@ def read_daq_csv(path: Path, *, sample_column: str | None = None, first_sample: 
         no whole number.
     """
     try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            refuse_other_separator(path, file.readline().split(","))
         table = pa.csv.read_csv(path)
     except (OSError, pa.ArrowException) as e:
         raise RunFormatError(f"{path}: not a readable CSV table: {e}") from e

@@ -318,6 +318,7 @@ def comparison_table(comparison: TruthComparison, *, from_rest: bool = False) ->
         box=box.SIMPLE_HEAD,
         show_edge=False,
         padding=(0, 1, 0, 0),
+        pad_edge=False,
         caption=None if from_rest else "95 %: the share of errors within what is stated to hold 95 %",
         caption_justify="left",
     )

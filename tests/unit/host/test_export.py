@@ -84,6 +84,8 @@ def test_the_laboratorys_rows_get_the_motion_of_the_same_sample(lab, tmp_path):
         ("a,a\n1,2\n", {}, "'a' stands twice"),
         ("sample,b\n1,2\n", {}, "a channel is called 'sample'"),
         ("a,b\n1\n", {}, "not a readable CSV"),
+        ("a;b\n1,5;2\n", {}, "parted by semicolons"),
+        ("a;b\n1.5;2\n", {}, "parted by semicolons"),
     ],
 )
 def test_a_wrong_daq_file_is_refused_with_words(tmp_path, text, options, words):

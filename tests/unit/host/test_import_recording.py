@@ -166,7 +166,10 @@ def test_the_picture_size_must_be_the_rigs(tmp_path):
 
 def test_text_is_no_video(tmp_path):
     (tmp_path / "v.h264").write_text("0\n1\n")
-    with pytest.raises(VideoError, match="no video that can be read"):
+    with pytest.raises(VideoError, match="no video that can be read.*Expected H.264"):
+        imported(tmp_path)
+    (tmp_path / "v.h264").write_bytes(b"")
+    with pytest.raises(VideoError, match="the file is empty"):
         imported(tmp_path)
 
 
@@ -179,6 +182,8 @@ def test_an_existing_run_is_never_overwritten(tmp_path):
 def test_a_run_id_with_a_path_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="run id"):
         imported(tmp_path, label="../x")
+    with pytest.raises(ConfigError, match="unit and label may hold letters"):
+        imported(tmp_path, unit="")  # a manifest without a unit could not be read again
 
 
 def imu_of(n=300, *, period_ns=10_001_000, acc=None, gyro=None, jitter_ns=40_000, missing=()):

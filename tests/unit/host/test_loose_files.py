@@ -92,6 +92,11 @@ def test_an_empty_value_is_a_missing_sample(write):
     [
         (IMU_HEADER, "no rows"),
         ("t_ns,ax_mps2\n1,2\n", "no column ay_mps2"),
+        (
+            IMU_HEADER.replace(",", ";") + "1;1,5;2;3;4;5;6\n",
+            "parted by semicolons.*commas between.*points in",
+        ),
+        (IMU_HEADER.replace(",", "\t") + "1\t1\t2\t3\t4\t5\t6\n", "parted by tabs"),
         (IMU_HEADER + "1,1,2,3,4,5\n", "line 2: 6 fields"),
         (IMU_HEADER + "1,1,2,3,4,5,x\n", "line 2: 'x' is no number"),
         (IMU_HEADER + "1.5,1,2,3,4,5,6\n", "line 2: t_ns is '1.5'"),

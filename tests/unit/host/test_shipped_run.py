@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from small_lab import example
 
-from bricktrack_common.errors import ConfigError, TrackingError, TransferError
+from bricktrack_common.errors import ConfigError, StorageError, TrackingError, TransferError
 from bricktrack_common.run_manifest import MANIFEST_NAME, file_entry, read_manifest, write_manifest
 from bricktrack_host.many_runs import shipped_run
 from bricktrack_host.many_runs.processing_record import read_record
@@ -93,6 +93,16 @@ def test_what_is_noted_tells_whether_results_stand(job, processing):
     assert other.input_sha256() != key
     (job.results / "processing.json").write_text("{")
     assert not is_processed(job, key)
+
+
+@pytest.mark.parametrize("what", ["calibration", "layout"])
+def test_a_file_that_is_missing_is_named_with_what_it_is_for(job, what):
+    path = getattr(job, what)
+    path.unlink()
+    with pytest.raises(
+        StorageError, match=rf"{path}: No such file.*the run's {what}; .*--{what} or in fleet"
+    ):
+        job.input_sha256()
 
 
 def test_a_worker_without_the_path_says_so(job, processing):
