@@ -15,13 +15,11 @@ from bricktrack_host.tracking.light_kernel import (
     ECCENTRICITY,
     FILL,
     MIN_CONTRAST,
-    Bytes,
     U,
     V,
-    fill_component,
     measure_windows,
-    stack_for,
 )
+from bricktrack_host.tracking.lit_pixels import Bytes, fill_component, stack_for
 
 _LEVELS = (0.55, 0.28, 0.12)
 """Fractions of the brightest light at which the decimated picture is cut: LEDs of one brick differ in
