@@ -20,6 +20,14 @@ _STILL = 5.0  # more where the brick must be taken not to move within the frame 
 _ROUNDS = 3  # false lights in one frame, the worst first
 
 
+def leave_out_fleeting(run: RunIdentities) -> None:
+    """Leave out what one frame alone shows, before anything is known of the run's motion: it may come again."""
+    frames, leds, needed = _newcomers(run)
+    fleeting = needed > _SURE
+    for led in np.unique(leds[fleeting]):
+        _leave_out(run, frames[fleeting & (leds == led)], np.full(1, led))
+
+
 def leave_out_newcomers(run: RunIdentities, usual_px: FloatArray) -> None:
     """Leave out the newcomers that may be other lights; frames of too few LEDs without them are refused.
 
@@ -34,7 +42,9 @@ def leave_out_newcomers(run: RunIdentities, usual_px: FloatArray) -> None:
             return
         for still in (False, True):
             missing = needed + still * _STILL - log_odds(run, frames, leds, usual_px, still=still)
-            frames, leds, needed, missing = (x[missing > 0] for x in (frames, leds, needed, missing))
+            doubtful = missing > 0
+            frames, leds = frames[doubtful], leds[doubtful]
+            needed, missing = needed[doubtful], missing[doubtful]
             if frames.size == 0:
                 return
         order = np.lexsort((-missing, frames))

@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter, median_filter
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.identity_motion import RunMotion, turn_between, unknown_motion
-from bricktrack_host.tracking.identity_newcomers import leave_out_newcomers
+from bricktrack_host.tracking.identity_newcomers import leave_out_fleeting, leave_out_newcomers
 from bricktrack_host.tracking.pattern import assign_predicted
 from bricktrack_host.tracking.refine import LedMotion
 from bricktrack_host.tracking.run_identities import (
@@ -34,6 +34,7 @@ _WARM_ROUNDS, _SETTLE_ROUNDS = 2, 3
 
 def settle(run: RunIdentities) -> None:
     """Judge every frame by how the run moves; what then does not fit is refused."""
+    leave_out_fleeting(run)
     _refuse_lone(run)
     had = run.n_found > 0
     usual_px = _settle_rounds(run)
