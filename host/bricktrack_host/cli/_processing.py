@@ -1,26 +1,27 @@
 """Runs processed by workers, here or on a cluster: bars meanwhile, and a word on each as it ends."""
 
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from bricktrack_common.errors import BricktrackError, ConfigError
-from bricktrack_host.cli._console import err, out, say_error
+from bricktrack_host.cli._console import err, say_error
+from bricktrack_host.cli._processed import say_stands, say_summary
+from bricktrack_host.cli._run_jobs import run_job
+from bricktrack_host.cli._stage_bar import StageBar, stage_bar, stage_bars
+from bricktrack_host.transfer.fleet_config import UnitConfig
+from bricktrack_host.transfer.pull import PulledRun
 
 # What computes is imported where it is used: `--help` and the units' commands need none of it.
 if TYPE_CHECKING:
     from bricktrack_host.many_runs.dask_cluster import TlsFiles
     from bricktrack_host.many_runs.run_job import RunJob, RunSummary
     from bricktrack_host.many_runs.workers import Instead, Workers
-    from bricktrack_host.pipeline import ProcessedRun
-    from bricktrack_host.results.truth import TruthComparison
 
 _PIPELINE = "bricktrack_host.many_runs.run_job"
 
@@ -116,44 +117,6 @@ class Where:
         return TlsFiles(authority, certificate, key)
 
 
-class StageBar:
-    """One bar that shows the stage under way and how far it is."""
-
-    def __init__(self, progress: Progress, run_id: str) -> None:
-        self._progress = progress
-        self._run_id = run_id
-        self._task: TaskID = progress.add_task(f"{run_id}: waits for a worker", total=None)
-
-    def stage(self, name: str, total: int | None) -> None:
-        """Show that a stage begins."""
-        self._progress.reset(self._task, total=total, description=f"{self._run_id}: {name}")
-
-    def advance_to(self, done: int) -> None:
-        """Show that so many steps of it are done."""
-        self._progress.update(self._task, completed=done)
-
-    def remove(self) -> None:
-        """Show nothing any more."""
-        self._progress.remove_task(self._task)
-
-
-def _bars() -> Progress:
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    return Progress(*columns, console=err, transient=True)
-
-
-@contextmanager
-def stage_bar(run_id: str) -> Iterator[StageBar]:
-    """Show the progress of one run on the terminal while the block runs."""
-    with _bars() as progress:
-        yield StageBar(progress, run_id)
-
-
 def process_here(job: "RunJob", *, again: bool) -> None:
     """Process one run in this process, and say what came of it.
 
@@ -171,6 +134,28 @@ def process_here(job: "RunJob", *, again: bool) -> None:
     with stage_bar(job.run.name) as bar:
         summary = process_job(job, key, bar)
     say_summary(summary)
+
+
+def process_folders(runs: list[Path], *, fleet: Path, where: Where) -> int:
+    """Process runs with what the fleet file names, say what became of each, and return how many failed."""
+    return process_side_by_side(runs, partial(run_job, fleet_file=fleet), where, again=False)
+
+
+def process_pulled(unit: UnitConfig, pulled: PulledRun) -> None:
+    """Process one run that was just pulled, with the calibration and layout that the fleet file names."""
+    from bricktrack_host.many_runs.run_job import RunJob
+    from bricktrack_host.pipeline import ProcessSettings
+    from bricktrack_host.stages.camera_sensor import choose_camera_sensor
+
+    if unit.calibration_path is None or unit.layout_path is None:
+        raise ConfigError(
+            f"fleet.toml names no calibration or no layout for unit '{unit.name}'. Add them, or "
+            f"process by hand: bricktrack process {pulled.folder} --calibration FILE --layout FILE"
+        )
+    sensor = choose_camera_sensor(pulled.folder, unit)
+    settings = ProcessSettings(camera=unit.camera, camera_sensor=sensor)
+    job = RunJob(pulled.folder, unit.calibration_path, unit.layout_path, settings)
+    process_here(job, again=False)
 
 
 def process_side_by_side(
@@ -209,7 +194,7 @@ def _process(todo: "list[tuple[RunJob, str]]", where: Where) -> int:
     workers = where.workers([job for job, _ in todo])
     bars: dict[int, StageBar] = {}
     n_failed = 0
-    with _bars() as progress:
+    with stage_bars() as progress:
         everything = progress.add_task("all runs", total=len(todo)) if len(todo) > 1 else None
 
         def begin(i: int) -> StageBar:
@@ -278,66 +263,3 @@ class _Sent:
                 "give --send bytes"
             )
         return Instead(self._parcel(i, as_bytes=True))
-
-
-def say_stands(jobs: "list[RunJob]") -> None:
-    """Say that results of before stand, because they are of the same input."""
-    if len(jobs) > 1:
-        out.print(f"{len(jobs)} runs are processed already, of the same input; --again does them anew")
-        return
-    out.print(
-        f"{jobs[0].run.name}: processed already, of the same input; --again does it anew",
-        markup=False,
-        soft_wrap=True,
-    )
-    out.print(f"results: {jobs[0].results}", markup=False, soft_wrap=True)
-
-
-def say_processed(processed: "ProcessedRun", *, budget: bool = True) -> None:
-    """Print what a processed run came to."""
-    from bricktrack_host.many_runs.run_job import summarise
-
-    say_summary(summarise(processed), budget=budget)
-
-
-def say_summary(summary: "RunSummary", *, budget: bool = True) -> None:
-    """Print the verdict and where it all is; with ``budget`` the times and the errors against truth too."""
-    out.print(f"{summary.run_id}: {summary.verdict}", markup=False, soft_wrap=True)
-    for problem in summary.problems:
-        out.print(f"  {problem}", style="yellow", markup=False, soft_wrap=True)
-    if budget:
-        say_truth(summary.truth)
-        _say_budget(summary.timings_s, summary.n_frames)
-    out.print(f"results: {summary.folder}", markup=False, soft_wrap=True)
-    out.print(f"report:  {summary.report}", markup=False, soft_wrap=True)
-    if summary.earlier is not None:
-        out.print(
-            f"earlier: {summary.earlier} (kept; what changed: 'bricktrack compare {summary.folder.parent}')",
-            markup=False,
-            soft_wrap=True,
-        )
-
-
-def _say_budget(timings_s: dict[str, float], n_frames: int) -> None:
-    table = Table(title="Time budget")
-    table.add_column("stage")
-    table.add_column("s", justify="right")
-    table.add_column("ms a frame", justify="right")
-    for name, seconds in timings_s.items():
-        table.add_row(name, f"{seconds:.2f}", f"{1000 * seconds / n_frames:.2f}")
-    total = sum(timings_s.values())
-    table.add_row("all", f"{total:.2f}", f"{1000 * total / n_frames:.2f}", style="bold")
-    out.print(table)
-
-
-def say_truth(comparison: "TruthComparison | None") -> None:
-    """Print the errors against simulated truth, absolute and as displacements from rest."""
-    from bricktrack_host.results.truth import comparison_table
-
-    if comparison is None:
-        return
-    out.print(comparison_table(comparison))
-    out.print()
-    if comparison.from_rest:
-        out.print(comparison_table(comparison, from_rest=True))
-        out.print()

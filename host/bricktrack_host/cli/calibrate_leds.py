@@ -56,7 +56,7 @@ def leds(
     from bricktrack_common.run_folder import read_run
     from bricktrack_host.calibration.calibration_file import load_calibration, rays_of_recording
     from bricktrack_host.cli._console import out
-    from bricktrack_host.cli.process import stage_bar
+    from bricktrack_host.cli._stage_bar import stage_bar
     from bricktrack_host.pipeline import observe_run
     from bricktrack_host.tracking.led_fit import LEAST_SHIFT_SD, fit_collar
     from bricktrack_host.tracking.led_positions import fit_positions

@@ -22,7 +22,8 @@ from bricktrack_common.errors import ConfigError, DeviceError, TransferError, Un
 from bricktrack_common.wire_messages import StatusReply
 from bricktrack_host.cli import calibrate
 from bricktrack_host.cli._console import err, out
-from bricktrack_host.cli.process import say_processed, stage_bar
+from bricktrack_host.cli._processed import say_processed
+from bricktrack_host.cli._stage_bar import stage_bar
 from bricktrack_host.transfer.fleet_config import load_fleet
 from bricktrack_host.transfer.unit_client import UnitClient
 

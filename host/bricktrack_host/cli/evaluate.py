@@ -11,8 +11,8 @@ from rich.table import Table
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.cli._console import out
-from bricktrack_host.cli._processing import StageBar, stage_bar
 from bricktrack_host.cli._progress import counting_bar
+from bricktrack_host.cli._stage_bar import StageBar, stage_bar
 
 if TYPE_CHECKING:
     from bricktrack_host.evaluation.scores import SweepScore

@@ -33,6 +33,7 @@ from bricktrack_host.cli import (
 )
 from bricktrack_host.cli._console import out, set_up_logging
 from bricktrack_host.cli._errors import BricktrackGroup
+from bricktrack_host.cli._processing import process_pulled
 from bricktrack_host.cli.pull import make_pull_command
 
 app = typer.Typer(
@@ -80,7 +81,7 @@ app.command("still", rich_help_panel=_UNITS)(still.still)
 app.command("configure", rich_help_panel=_UNITS)(configure.configure)
 app.command("delete", rich_help_panel=_UNITS)(delete.delete)
 app.add_typer(keys.app, name="keys", rich_help_panel=_UNITS)
-app.command("pull", rich_help_panel=_UNITS)(make_pull_command(process.process_pulled))
+app.command("pull", rich_help_panel=_UNITS)(make_pull_command(process_pulled))
 app.command("import", rich_help_panel=_RUNS)(import_cmd.import_recording)
 app.command("target", rich_help_panel=_CAMERAS)(target.target)
 calibrate.app.command("leds")(calibrate_leds.leds)

@@ -2,15 +2,14 @@
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import msgspec
 import typer
 
 from bricktrack_common.errors import ConfigError
-from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.cli._console import say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
+from bricktrack_host.cli._processed import TruthOption
 from bricktrack_host.cli._processing import (
     JobsOption,
     SchedulerOption,
@@ -21,30 +20,10 @@ from bricktrack_host.cli._processing import (
     Where,
     process_here,
     process_side_by_side,
-    say_processed,
-    say_truth,
-    stage_bar,
 )
-from bricktrack_host.cli._units import FleetOption, fleet_path
+from bricktrack_host.cli._run_jobs import run_job
+from bricktrack_host.cli._units import FleetOption
 from bricktrack_host.transfer.camera_config import CameraMount
-from bricktrack_host.transfer.fleet_config import UnitConfig, load_fleet
-from bricktrack_host.transfer.pull import PulledRun
-
-# What computes is imported by the command that runs it: OpenCV, SciPy, PyArrow and matplotlib take seconds
-# to load, and `--help`, `status` and `pull` need none of them.
-if TYPE_CHECKING:
-    from bricktrack_host.many_runs.run_job import RunJob
-    from bricktrack_host.pipeline import ProcessSettings
-
-__all__ = [
-    "TruthOption",
-    "process",
-    "process_folders",
-    "process_pulled",
-    "say_processed",
-    "say_truth",
-    "stage_bar",
-]
 
 _MOVING = "A camera that moves"
 CalibrationOption = Annotated[
@@ -54,10 +33,6 @@ CalibrationOption = Annotated[
 LayoutOption = Annotated[
     Path | None,
     typer.Option("--layout", "-l", help="Layout file of the brick. \\[default: the fleet file's]"),
-]
-TruthOption = Annotated[
-    Path | None,
-    typer.Option("--truth", help="True motion of a simulated run: a file, or a folder that holds one."),
 ]
 
 
@@ -146,6 +121,7 @@ def process(
 
         bricktrack process runs/b7-2_9f31c2_0007_shake-12 --table shake-12.csv --sample-column Sample
     """
+    # What computes is imported where it is used: it takes seconds to load, and `--help` needs none of it.
     from bricktrack_host.pipeline import ProcessSettings
 
     if output is not None and len(runs) > 1:
@@ -168,7 +144,7 @@ def process(
         "camera_run": camera_run, "table": table, "sample_column": sample_column, "first_sample": first_sample
     }  # fmt: skip
     job_of = partial(
-        _job, calibration=calibration, layout=layout, camera=camera, fleet_file=fleet, settings=settings,
+        run_job, calibration=calibration, layout=layout, camera=camera, fleet_file=fleet, settings=settings,
         output=output, truth=truth, feels=feels,
     )  # fmt: skip
     if len(runs) == 1 and scheduler is None:
@@ -178,73 +154,3 @@ def process(
     if failed:
         say_error(f"{failed} of {len(runs)} runs could not be processed")
         raise typer.Exit(EXIT_ERROR)
-
-
-def process_folders(runs: list[Path], *, fleet: Path, where: Where) -> int:
-    """Process runs with what the fleet file names, say what became of each, and return how many failed."""
-    return process_side_by_side(runs, partial(_job, fleet_file=fleet), where, again=False)
-
-
-def process_pulled(unit: UnitConfig, pulled: PulledRun) -> None:
-    """Process one run that was just pulled, with the calibration and layout that the fleet file names."""
-    from bricktrack_host.many_runs.run_job import RunJob
-    from bricktrack_host.pipeline import ProcessSettings
-    from bricktrack_host.stages.camera_sensor import choose_camera_sensor
-
-    if unit.calibration_path is None or unit.layout_path is None:
-        raise ConfigError(
-            f"fleet.toml names no calibration or no layout for unit '{unit.name}'. Add them, or "
-            f"process by hand: bricktrack process {pulled.folder} --calibration FILE --layout FILE"
-        )
-    sensor = choose_camera_sensor(pulled.folder, unit)
-    settings = ProcessSettings(camera=unit.camera, camera_sensor=sensor)
-    job = RunJob(pulled.folder, unit.calibration_path, unit.layout_path, settings)
-    process_here(job, again=False)
-
-
-def _job(
-    run: Path,
-    *,
-    fleet_file: Path | None,
-    calibration: Path | None = None,
-    layout: Path | None = None,
-    camera: CameraMount | None = None,
-    settings: "ProcessSettings | None" = None,
-    output: Path | None = None,
-    truth: Path | None = None,
-    feels: dict[str, Any] | None = None,
-) -> "RunJob":
-    """Return a run with what the options name, or else the fleet file for the run's unit.
-
-    ``feels``: where to find what feels the camera's motion, see `choose_camera_sensor`.
-    """
-    from bricktrack_host.many_runs.run_job import RunJob
-    from bricktrack_host.pipeline import ProcessSettings
-    from bricktrack_host.stages.camera_sensor import choose_camera_sensor
-
-    feels = feels or {}
-    sensor = None
-    if fleet_file is None and (feels.get("camera_run") or feels.get("table")):
-        fleet_file = fleet_path(None)  # which says how that sensor sits
-    if fleet_file is not None or calibration is None or layout is None:
-        unit = _unit_of(run, fleet_file)
-        calibration, layout = calibration or unit.calibration_path, layout or unit.layout_path
-        if calibration is None or layout is None:
-            raise ConfigError(
-                f"{fleet_path(fleet_file)}: unit '{unit.name}' has no "
-                f"{'calibration' if calibration is None else 'layout'}"
-            )
-        camera = camera or unit.camera
-        if camera == unit.camera:
-            sensor = choose_camera_sensor(run, unit, **feels)
-    settings = msgspec.structs.replace(
-        settings or ProcessSettings(), camera=camera or "static", camera_sensor=sensor
-    )
-    return RunJob(run, calibration, layout, settings, output=output, truth=truth)
-
-
-def _unit_of(run: Path, fleet_file: Path | None) -> UnitConfig:
-    path = fleet_path(fleet_file)
-    if fleet_file is None and not path.exists():
-        raise ConfigError("give --calibration and --layout, or a fleet file that names them for the unit")
-    return load_fleet(path).select([read_manifest(run / MANIFEST_NAME).unit])[0]

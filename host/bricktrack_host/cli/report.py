@@ -7,7 +7,7 @@ import typer
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.cli._console import err, out
-from bricktrack_host.cli.process import TruthOption, say_truth
+from bricktrack_host.cli._processed import TruthOption, say_truth
 
 
 def report(

@@ -39,6 +39,7 @@ from bricktrack_host.cli._processing import (
     TlsCertificateOption,
     TlsKeyOption,
     Where,
+    process_folders,
 )
 from bricktrack_host.cli._units import (
     ChosenUnits,
@@ -50,7 +51,6 @@ from bricktrack_host.cli._units import (
 )
 from bricktrack_host.cli.combine import combine
 from bricktrack_host.cli.fleet import wait_until_saved
-from bricktrack_host.cli.process import process_folders
 from bricktrack_host.cli.pull import pull_with_bars
 from bricktrack_host.transfer.contact import Contact
 from bricktrack_host.transfer.fleet_config import UnitConfig
