@@ -58,6 +58,9 @@ class PoseFlag(IntFlag):
     UNSURE_TIME = 8192
     """The stamps here disagree with the camera's steady rate or with the inertial samples, so the instant of
     the pose is unsure. The covariance says so."""
+    CONTESTED = 16384
+    """Fused: a frame and the inertial samples contradict each other here, and either may be right. The pose
+    is the mean of both, and the covariance reaches both."""
 
 
 def describe(flags: int) -> str:

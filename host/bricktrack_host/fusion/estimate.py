@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ConfigError, ShapeError
 from bricktrack_host.fusion.camera_delay import settle_delay
+from bricktrack_host.fusion.contested_frames import with_contested_frames
 from bricktrack_host.fusion.cross_check import CrossCheck
 from bricktrack_host.fusion.fused_output import common_part, sample_motion
 from bricktrack_host.fusion.fusion_problem import NoiseLevel, Run
@@ -305,17 +306,27 @@ def fused_result(
     if rejected.any() and track is None:
         logger.warning("%d of %d optical poses left out as outliers", rejected.sum(), len(s.run.frame))
 
-    def sample(estimate: Estimate, *, is_smoothed: bool) -> FusedTrack:
+    def sample(estimate: Estimate, *, is_smoothed: bool, t_ns: IntArray = item.output_t_ns) -> FusedTrack:
         return sample_motion(
             s.run, s.nodes, s.problem, estimate, s.b,
-            output_t_ns=item.output_t_ns, seen_cam_s=s.run.t_cam_s[s.used],
+            output_t_ns=t_ns, seen_cam_s=s.run.t_cam_s[s.used],
             common=common_part(s.run.cov_seen, s.scale, settings.optical_common_share),
             settings=settings, is_smoothed=is_smoothed,
         )  # fmt: skip
 
+    if track is None:
+        track = sample(s.estimate, is_smoothed=True)
+        contested = rejected & (chi2 < settings.contest_chi2)
+        if contested.any():
+            frames = item.optical
+            track = with_contested_frames(
+                track, sample(s.estimate, is_smoothed=True, t_ns=frames.t_ns[contested]),
+                frames.R_camera_brick[contested], frames.t_camera_brick_mm[contested],
+                period_ns=float(np.median(np.diff(frames.t_ns))),
+            )  # fmt: skip
     sd = np.sqrt(np.maximum(variance.mean(axis=0), 0.0))
     return FusionResult(
-        track=track or sample(s.estimate, is_smoothed=True),
+        track=track,
         forward=sample(s.passed.forward(), is_smoothed=False) if with_forward else None,
         alignment=s.run.alignment,
         offset_ns=float(x[0, TAU] * 1e9),

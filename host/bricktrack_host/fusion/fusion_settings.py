@@ -53,6 +53,9 @@ class FusionSettings:
     gate_chi2 : float
         A frame whose residual to all the others, squared over its covariance, exceeds this is left out
         (6 degrees of freedom; 33 is passed by all but one in 100 000).
+    contest_chi2 : float
+        A frame that is left out counts for nothing beyond this, and below it for as much as the samples that
+        contradict it, see `contested_frames`: some 24 sd, past what lights and lenses do to a pose.
     impact_mps2 : float
         Height above which a pulse is flagged as an impact.
     max_position_sd_mm, max_rotation_sd_rad : float
@@ -83,6 +86,7 @@ class FusionSettings:
     acc_loss_sd_s2: float = 4e-6
     optical_common_share: float = 0.3
     gate_chi2: float = 33.0
+    contest_chi2: float = 600.0
     impact_mps2: float = 3.0
     max_position_sd_mm: float = 50.0
     max_rotation_sd_rad: float = 0.3
