@@ -15,13 +15,13 @@ from bricktrack_host.tracking.run_identities import RunIdentities
 from bricktrack_host.tracking.verification import MIN_INLIERS, motion_of
 
 _SURE = 5.0  # log odds that an LED be believed: 150 to one
-_FLEETING = 5.0  # more for one that neither the frame before nor the one after shows
-_STILL = 5.0  # more where the brick must be taken not to move within the frame as its run does
+_FLEETING = 10.0  # more for one that neither the frame before nor the one after shows
+_STILL = 5.0  # more if the brick must be taken not to move within the frame, though its run does
 _ROUNDS = 3  # false lights in one frame, the worst first
 
 
 def leave_out_fleeting(run: RunIdentities) -> None:
-    """Leave out what one frame alone shows, before anything is known of the run's motion: it may come again."""
+    """Leave out what one frame alone shows, before the run's motion is known: what is true comes again."""
     frames, leds, needed = _newcomers(run)
     fleeting = needed > _SURE
     for led in np.unique(leds[fleeting]):

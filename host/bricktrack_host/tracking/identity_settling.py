@@ -12,6 +12,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.identity_motion import RunMotion, turn_between, unknown_motion
 from bricktrack_host.tracking.identity_newcomers import leave_out_fleeting, leave_out_newcomers
+from bricktrack_host.tracking.identity_smoothing import steady_poses
 from bricktrack_host.tracking.pattern import assign_predicted
 from bricktrack_host.tracking.refine import LedMotion
 from bricktrack_host.tracking.run_identities import (
@@ -35,6 +36,7 @@ _WARM_ROUNDS, _SETTLE_ROUNDS = 2, 3
 def settle(run: RunIdentities) -> None:
     """Judge every frame by how the run moves; what then does not fit is refused."""
     leave_out_fleeting(run)
+    _steady(run)
     _refuse_lone(run)
     had = run.n_found > 0
     usual_px = _settle_rounds(run)
@@ -44,6 +46,16 @@ def settle(run: RunIdentities) -> None:
     beside = maximum_filter((had & (n_found == 0)).astype(np.int64), 5, mode="constant") > 0
     turn, _ = run.turns()
     run.refuse(np.flatnonzero(beside & (n_found > 0) & (n_found < run.brick_model.n_leds) & np.isnan(turn)))
+
+
+def _steady(run: RunIdentities) -> None:
+    """Give a run's frames steady poses where it has frames that turn off their neighbours' course."""
+    turn, _ = run.turns()
+    if not (turn > 3 * _LEAST_TURN_RAD).any():
+        return
+    known = run.known_frames()
+    R, t_mm = steady_poses(run, np.ones(len(run.blobs)))
+    run.found.R_camera_brick[known], run.found.t_camera_brick_mm[known] = R[known], t_mm[known]
 
 
 def _refuse_lone(run: RunIdentities) -> None:
