@@ -10,6 +10,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.fused_output import unsure_times
+from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial_hint import InertialHint
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.tight import fuse_tight
@@ -21,6 +22,9 @@ from bricktrack_host.tracking.optical_track import led_motion, solve_poses
 from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1
+# How far samples are to be believed decides about dropouts and impacts. Within a frame's 20 ms it changes
+# nothing: over six simulated runs the fused error is 0.5 % more than with the noise chosen for each run.
+_WITHIN_FRAMES = FusionSettings(adapt_noise=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +75,9 @@ def retime(
     for _ in range(_RETIME_PASSES):
         wanted = np.concatenate([optical.t_ns, optical.led_t_ns.ravel()])
         try:
-            track = _by_poses(optical, inertial, brick.imu_lever_arm_mm, wanted).track
+            track = _by_poses(
+                optical, inertial, brick.imu_lever_arm_mm, wanted, settings=_WITHIN_FRAMES
+            ).track
         except (ShapeError, TrackingError):
             return optical  # the fusion itself will say why
         motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)))
@@ -82,12 +88,17 @@ def retime(
 
 
 def _by_poses(
-    optical: OpticalTrack, inertial: Inertial, lever_arm_mm: FloatArray, wanted: IntArray
+    optical: OpticalTrack,
+    inertial: Inertial,
+    lever_arm_mm: FloatArray,
+    wanted: IntArray,
+    *,
+    settings: FusionSettings | None = None,
 ) -> FusionResult:
     return fuse(
         optical, inertial.imu, lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=inertial.alignment,
         camera="static" if inertial.camera is None else inertial.camera.kind,
-        camera_imu=inertial.camera, camera_alignment=inertial.camera_alignment,
+        camera_imu=inertial.camera, camera_alignment=inertial.camera_alignment, settings=settings,
     )  # fmt: skip
 
 
