@@ -6,7 +6,8 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.imu_samples import CleanSamples, clean_samples, seconds_since
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.moving_camera import CameraMotion, imu_seconds, still_track
 from bricktrack_host.fusion.sensor_errors import SensorErrors
 from bricktrack_host.fusion.smoother import (
@@ -69,6 +70,7 @@ class Run:
     """
 
     imu: ImuTrack
+    samples: CleanSamples
     signal: ImuSignal
     alignment: TimeAlignment
     lever_arm_m: FloatArray
@@ -96,7 +98,8 @@ class Run:
         camera: CameraMotion | None = None,
     ) -> "Run":
         """Return what of a run is used: frames with a pose, and the time to be covered."""
-        signal = ImuSignal.from_track(imu, gyro_filter_s=alignment.gyro_filter_s)
+        samples = clean_samples(imu)
+        signal = ImuSignal.from_samples(samples, gyro_filter_s=alignment.gyro_filter_s)
         if camera is not None:
             optical = still_track(optical, camera, imu_seconds(alignment, optical.t_ns, signal.epoch_ns))
         seen = np.flatnonzero(has_pose(optical))
@@ -116,6 +119,7 @@ class Run:
         )
         return cls(
             imu=imu,
+            samples=samples,
             signal=signal,
             alignment=alignment,
             lever_arm_m=lever_arm_mm * 1e-3,
@@ -131,26 +135,25 @@ class Run:
 
     def with_acc_loss(self, loss_s2: float) -> "Run":
         """Return the run with the accelerometer's low-pass undone as far as is known now."""
-        signal = ImuSignal.from_track(
-            self.imu,
-            gyro_filter_s=self.alignment.gyro_filter_s,
-            acc_filter_s=float(np.sqrt(max(loss_s2, 0.0))),
-            gyro_gain=self.gyro_gain,
-            acc_gain=self.acc_gain,
-        )
+        signal = self.signal.with_acc_filter(float(np.sqrt(max(loss_s2, 0.0))))
         camera = None if self.camera is None else self.camera.with_acc_loss(loss_s2)
         return replace(self, signal=signal, camera=camera)
 
     def with_sensor(self, errors: SensorErrors) -> "Run":
         """Return the run with the errors of the sensor, and of its place, taken out."""
-        run = replace(
+        gyro_gain = (np.eye(3) + errors.gyro) @ self.gyro_gain
+        acc_gain = (np.eye(3) + errors.acc) @ self.acc_gain
+        return replace(
             self,
+            signal=ImuSignal.from_samples(
+                self.samples.without_gains(gyro_gain, acc_gain), gyro_filter_s=self.alignment.gyro_filter_s
+            ),
+            camera=None if self.camera is None else self.camera.with_acc_loss(0.0),
             lever_arm_m=self.lever_arm_m + errors.arm_m,
-            gyro_gain=(np.eye(3) + errors.gyro) @ self.gyro_gain,
-            acc_gain=(np.eye(3) + errors.acc) @ self.acc_gain,
+            gyro_gain=gyro_gain,
+            acc_gain=acc_gain,
             sensor_covariance=errors.covariance,
         )
-        return run.with_acc_loss(0.0)
 
     def imu_time_s(self, t_cam_s: FloatArray, lin: Linearisation) -> FloatArray:
         """Return IMU time of camera time at the linearisation point."""

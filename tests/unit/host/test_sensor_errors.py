@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from bricktrack_host.fusion.estimate import FusionInput, fuse, prepare_run
 from bricktrack_host.fusion.fusion_problem import NoiseLevel, build_problem, first_linearisation, place_nodes
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.sensor_errors import estimate_sensor_errors, with_sensor_doubt
+from bricktrack_host.fusion.sensor_errors import SensorErrors, estimate_sensor_errors, with_sensor_doubt
 from bricktrack_host.fusion.smoother import POS, SEEN, Filter
 from bricktrack_host.quality import PoseFlag
 
@@ -76,7 +76,7 @@ def test_what_is_carried_along_is_the_derivative_of_the_smoothed_motion():
         gains = np.zeros(18)
         gains[error] = size = 1e-3
         gyro, acc = gains.reshape(2, 3, 3)
-        changed = replace(run, gyro_gain=np.eye(3) + gyro, acc_gain=np.eye(3) + acc).with_acc_loss(0.0)
+        changed = run.with_sensor(SensorErrors(gyro, acc, np.zeros(3), np.zeros((21, 21))))
         again = Filter(build(changed)).smooth(SEEN)
         turn = Rotation.from_matrix(
             np.swapaxes(estimate.state.R[:, 0], 1, 2) @ again.state.R[:, 0]
