@@ -1,21 +1,22 @@
 """LEDs one by one as the smoother's measurements: each at its own row's instant, through the ray model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
+from bricktrack_common.rotations import skew
 from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, NoiseLevel, Run, noise_parts
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import seconds_since
 from bricktrack_host.fusion.observation_kernel import LedArrays
 from bricktrack_host.fusion.smoother import Estimate, Problem
-from bricktrack_host.tracking.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.led_profile import LedPrediction, collar_of, predict_leds, shift_per_radius
 from bricktrack_host.tracking.led_tracker import NOT_USED
 from bricktrack_host.tracking.optical_track import led_times_ns
-from bricktrack_host.tracks import LedObservations
+from bricktrack_host.tracks import FusedTrack, LedObservations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +29,8 @@ class SeenLeds:
     t_ns : ndarray of int64, shape (m,), camera time
         Mid-exposure of the LED's row.
     uv_px, cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
+    spread_ns : ndarray, shape (m,), ns
+        Standard deviation of the instants at which its light was gathered: by exposure, and by its rows.
     """
 
     frame: IntArray
@@ -35,6 +38,7 @@ class SeenLeds:
     t_ns: IntArray
     uv_px: FloatArray
     cov_px2: FloatArray
+    spread_ns: FloatArray
 
     @classmethod
     def of(cls, observations: LedObservations, ray_model: RayModel) -> "SeenLeds":
@@ -46,14 +50,21 @@ class SeenLeds:
         frame, led = np.nonzero(usable)
         order = np.argsort(t_ns[frame, led], kind="stable")
         frame, led = frame[order], led[order]
+        # Even over the exposure; over a disc's rows as a disc is wide.
+        rows = np.sqrt(np.nan_to_num(observations.area_px2[frame, led]) / np.pi) / 2
+        row_ns = ray_model.sensor_mode.row_delay_ns(1.0) - ray_model.sensor_mode.row_delay_ns(0.0)
+        spread_ns = np.hypot(observations.exposure_ns[frame] / np.sqrt(12), rows * row_ns)
         return cls(frame, led, t_ns[frame, led], observations.uv_px[frame, led],
-                   observations.cov_px2[frame, led])  # fmt: skip
+                   observations.cov_px2[frame, led], spread_ns)  # fmt: skip
 
     def take(self, rows: BoolArray) -> "SeenLeds":
         """Return some of the rows."""
-        return SeenLeds(
-            self.frame[rows], self.led[rows], self.t_ns[rows], self.uv_px[rows], self.cov_px2[rows]
-        )
+        return SeenLeds(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def instants_ns(self) -> IntArray:
+        """Return the middle of each one's light, one spread before and one after, shape (3, m)."""
+        aside = np.rint(self.spread_ns).astype(np.int64)
+        return np.stack([self.t_ns, self.t_ns - aside, self.t_ns + aside])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,8 +78,12 @@ class Pictured:
         Seen less predicted.
     J_px : ndarray, shape (m, 2, 6)
         Of the prediction, by [dtheta rad, dt mm].
-    cov_px2 : ndarray, shape (m, 2, 2)
-        Of the centroid, with what the profile leaves unknown.
+    profile_shift_px : ndarray, shape (m, 2)
+        One standard deviation of what the profile leaves unknown, the same way in all LEDs.
+    from_centre_px : ndarray, shape (m, 2)
+        The predicted picture less the middle of the sensor's.
+    px_per_s : ndarray, shape (m, 2)
+        How fast the picture moves.
     is_facing : ndarray of bool, shape (m,)
         Whether the dome can be seen at all from there.
     """
@@ -77,31 +92,54 @@ class Pictured:
     t_camera_brick_mm: FloatArray
     residual_px: FloatArray
     J_px: FloatArray
-    cov_px2: FloatArray
+    profile_shift_px: FloatArray
+    from_centre_px: FloatArray
+    px_per_s: FloatArray
     is_facing: BoolArray
 
 
 def picture(
-    leds: SeenLeds, R: FloatArray, t_mm: FloatArray, ray_model: RayModel, brick_model: BrickModel
+    leds: SeenLeds, motion: tuple[FusedTrack, FusedTrack, FusedTrack], ray_model: RayModel, brick: BrickModel
 ) -> Pictured:
-    """Predict seen LEDs for poses at their instants, shapes (m, 3, 3) and (m, 3)."""
-    # `predict_brick` predicts whole bricks: one for each frame, of which the LEDs seen are put in place.
-    frames, row = np.unique(leds.frame, return_inverse=True)
-    shape = (len(frames), brick_model.n_leds)
-    R_all, t_all = np.empty((*shape, 3, 3)), np.empty((*shape, 3))
-    R_all[row], t_all[row] = R[:, None], t_mm[:, None]
-    R_all[row, leds.led], t_all[row, leds.led] = R, t_mm
-    prediction, J = predict_brick(R_all, t_all, ray_model, brick_model, collar_mm=collar_of(brick_model))
-    at = row, leds.led
-    shift = prediction.model_shift_px[at]
+    """Predict seen LEDs for the motion at their `SeenLeds.instants_ns`.
+
+    A brick that is accelerated is not, on the mean over the time that its light is gathered, where it is in
+    the middle: by half the spread's square times the acceleration. The mean of the pictures a spread before
+    and after shows as much.
+    """
+    middle, *beside = motion
+    prediction, J = _predict(leds, middle, ray_model, brick)
+    mean_px = 0.5 * sum(_predict(leds, track, ray_model, brick)[0].uv_px for track in beside)
+    twist = np.concatenate([middle.omega_brick_radps, middle.v_camera_mmps], axis=1)
+    mode = ray_model.sensor_mode
     return Pictured(
-        R_camera_brick=R,
-        t_camera_brick_mm=t_mm,
-        residual_px=leds.uv_px - prediction.uv_px[at],
-        J_px=J[at],
-        cov_px2=leds.cov_px2 + shift[:, :, None] * shift[:, None, :],
-        is_facing=np.asarray(prediction.facing[at] > 0, dtype=np.bool_),
+        R_camera_brick=middle.R_camera_brick,
+        t_camera_brick_mm=middle.t_camera_brick_mm,
+        residual_px=leds.uv_px - mean_px,
+        J_px=J,
+        profile_shift_px=prediction.model_shift_px,
+        from_centre_px=prediction.uv_px - 0.5 * np.array([mode.width - 1, mode.height - 1]),
+        px_per_s=np.einsum("mij,mj->mi", J, twist),
+        is_facing=np.asarray(prediction.facing > 0, dtype=np.bool_),
     )
+
+
+def _predict(
+    leds: SeenLeds, motion: FusedTrack, ray_model: RayModel, brick: BrickModel
+) -> tuple[LedPrediction, FloatArray]:
+    """Return predictions, shape (m,), and derivatives by the pose, shape (m, 2, 6), of single LEDs."""
+    P, N = brick.led_positions_mm[leds.led], brick.led_axes[leds.led]
+    R = motion.R_camera_brick
+    prediction = predict_leds(
+        np.einsum("mij,mj->mi", R, P) + motion.t_camera_brick_mm,
+        np.einsum("mij,mj->mi", R, N),
+        brick.led_radii_mm[leds.led],
+        ray_model,
+        collar_mm=collar_of(brick),
+        shift_sd_per_radius=shift_per_radius(collar_of(brick), brick),
+    )
+    turn = prediction.J_px_per_mm @ (R @ skew(P)) + prediction.J_px_per_axis @ (R @ skew(N))
+    return prediction, np.concatenate([-turn, prediction.J_px_per_mm], axis=2)
 
 
 def led_arrays(
@@ -112,14 +150,14 @@ def led_arrays(
     lin: Linearisation,
     levels: tuple[NoiseLevel, NoiseLevel],
     *,
-    scale: float,
+    scale: FloatArray,
     use: BoolArray,
     settings: FusionSettings,
 ) -> LedArrays:
     """Return the smoother's measurements of one run: each LED tied to the node nearest in time.
 
-    ``scale`` multiplies the stated sd of the centroids; ``use`` says which are shown to the filter. What the
-    inertial samples leave unsure between node and LED is added to the covariance.
+    ``scale``, shape (m,), multiplies the stated sd of the centroids; ``use`` says which are shown to the
+    filter. What the inertial samples leave unsure between node and LED is added to the covariance.
     """
     t_cam_s = seconds_since(leds.t_ns, run.signal.epoch_ns)
     t_s = run.imu_time_s(t_cam_s, lin)
@@ -136,7 +174,7 @@ def led_arrays(
     turn = parts.gyro(levels[0]) * np.abs(dt)
     shift = parts.acc(levels[1]) * np.abs(dt) ** 3 / 3
     between = np.repeat(np.stack([turn, shift], axis=1), 3, axis=1)
-    cov = scale**2 * pictured.cov_px2 + np.einsum("mik,mk,mjk->mij", J, between, J)
+    cov = scale[:, None, None] ** 2 * leds.cov_px2 + np.einsum("mik,mk,mjk->mij", J, between, J)
     first = np.searchsorted(node, np.arange(len(nodes.t_s) + 1))[:, None].astype(np.int64)
     return LedArrays(
         first=first,

@@ -17,22 +17,16 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_host.fusion.cross_check import CrossCheck, cross_check
 from bricktrack_host.fusion.estimate import FusionInput, FusionResult, fused_result, prepare_run
-from bricktrack_host.fusion.fused_output import common_part, sample_motion
-from bricktrack_host.fusion.fusion_problem import Nodes, Run, build_problem, place_nodes
+from bricktrack_host.fusion.fused_output import sample_motion
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import seconds_since
-from bricktrack_host.fusion.led_measurements import SeenLeds, led_arrays, led_chi2, picture
-from bricktrack_host.fusion.pose_level import Smoothed, relinearised, smooth_poses
-from bricktrack_host.fusion.smoother import Filter
+from bricktrack_host.fusion.led_measurements import SeenLeds
+from bricktrack_host.fusion.led_smoothing import smooth_leds
+from bricktrack_host.fusion.pose_level import smooth_poses
 from bricktrack_host.fusion.time_alignment import TimeAlignment
 from bricktrack_host.tracks import ImuTrack, LedObservations, OpticalTrack
 
 logger = logging.getLogger(__name__)
-
-_PASSES = 3
-_GATE_CHI2 = 20.7  # of 2 degrees of freedom; passed by all but one in 30 000
-_SCALE_STANDS = 1.05
-_CHI_2_MEDIAN = 1.386  # median of chi-square with 2 degrees of freedom
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,18 +97,20 @@ def fuse_tight(
     item = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment)
     first = smooth_poses([prepare_run(item, settings)], settings)[0]
     pose_level = fused_result(item, first, settings)
-    leds = SeenLeds.of(observations, ray_model)
-    leds, smoothed, chi2, use, scale = _smooth_leds(leds, first, ray_model, brick_model, settings)
+    done = smooth_leds(
+        SeenLeds.of(observations, ray_model), first, ray_model, brick_model,
+        lever_arm_m=np.asarray(lever_arm_mm, dtype=np.float64) * 1e-3, settings=settings,
+    )  # fmt: skip
+    leds, smoothed, use, scale = done.leds, done.states, done.use, float(done.noise_scales[0])
     seen_ns = np.unique(optical.t_ns[leds.frame[use]])
     track = sample_motion(
         smoothed.run, smoothed.nodes, smoothed.problem, smoothed.estimate, 0,
         output_t_ns=output_t_ns, seen_cam_s=seconds_since(seen_ns, smoothed.run.signal.epoch_ns),
-        common=common_part(first.run.cov_seen, first.scale, settings.optical_common_share),
-        settings=settings, is_smoothed=True,
+        common=np.zeros((6, 6)), settings=settings, is_smoothed=True,
     )  # fmt: skip
     shape = observations.uv_px.shape[:2]
     chi2_of_led, rejected = np.full(shape, np.nan), np.zeros(shape, dtype=np.bool_)
-    chi2_of_led[leds.frame, leds.led], rejected[leds.frame, leds.led] = chi2, ~use
+    chi2_of_led[leds.frame, leds.led], rejected[leds.frame, leds.led] = done.chi2, ~use
     if rejected.any():
         logger.warning("%d of %d LED centroids left out as outliers", rejected.sum(), len(use))
     check = cross_check(track, pose_level.track)
@@ -131,73 +127,3 @@ def fuse_tight(
         rotation_noise_scale=scale, position_noise_scale=scale, pose_level=pose_level.track, check=check,
     )  # fmt: skip
     return TightResult(fused, pose_level, check, chi2_of_led, rejected, scale)
-
-
-def _smooth_leds(
-    leds: SeenLeds,
-    first: Smoothed,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    settings: FusionSettings,
-) -> tuple[SeenLeds, Smoothed, FloatArray, BoolArray, float]:
-    """Return the LEDs that could be placed, the smoothed states, and how far each lies from the others.
-
-    Pictures are predicted for the pose-level motion, then for what came of it, and so on. Outliers are judged
-    with hindsight each time and may come back.
-    """
-    now, scale = first, 1.0
-    use = np.ones(len(leds.t_ns), dtype=np.bool_)
-    for i in range(_PASSES):
-        R, t_mm = _poses_at(now, leds.t_ns, first.run.t_cam_s, settings)
-        placed = np.asarray(np.isfinite(t_mm).all(axis=1), dtype=np.bool_)
-        leds, use = leds.take(placed), use[placed]
-        pictured = picture(leds, R[placed], t_mm[placed], ray_model, brick_model)
-        use = use & pictured.is_facing
-        lin = relinearised(now.run, now.estimate, now.b, len(now.nodes.t_s), settings)
-        run = _without_frames(first.run.with_acc_loss(lin.loss_s2))
-        nodes = Nodes(place_nodes(first.run, lin).t_s, np.zeros(0, dtype=np.int64))
-        problem, _ = build_problem(
-            [run], [nodes], [lin], settings=settings, use_frame=[np.zeros(0, dtype=np.bool_)],
-            noise_scale=[np.ones(2)], levels=[first.levels],
-        )  # fmt: skip
-        problem = replace(
-            problem,
-            leds=led_arrays(
-                leds, pictured, run, nodes, lin, first.levels, scale=scale, use=use, settings=settings
-            ),
-        )
-        passed = Filter(problem)
-        estimate = passed.smooth()
-        chi2 = led_chi2(problem, estimate)
-        now = replace(
-            first, run=run, nodes=nodes, lin=lin, problem=problem, passed=passed, estimate=estimate, b=0
-        )
-        more = max(float(np.sqrt(np.median(chi2[use]) / _CHI_2_MEDIAN)), 1.0 / scale)
-        good = (chi2 < _GATE_CHI2 * more**2) & pictured.is_facing
-        is_settled = i > 0 and more < _SCALE_STANDS and np.array_equal(good, use)
-        if is_settled or i == _PASSES - 1:
-            break
-        scale, use = scale * more, good
-    return leds, now, chi2, use, scale
-
-
-def _poses_at(
-    s: Smoothed, t_ns: IntArray, seen_cam_s: FloatArray, settings: FusionSettings
-) -> tuple[FloatArray, FloatArray]:
-    """Return smoothed poses at instants, NaN where the motion is not known."""
-    track = sample_motion(
-        s.run, s.nodes, s.problem, s.estimate, s.b, output_t_ns=t_ns, seen_cam_s=seen_cam_s,
-        common=np.zeros((6, 6)), settings=settings, is_smoothed=True,
-    )  # fmt: skip
-    return track.R_camera_brick, track.t_camera_brick_mm
-
-
-def _without_frames(run: Run) -> Run:
-    """Return the run without its poses."""
-    return replace(
-        run,
-        t_cam_s=np.zeros(0),
-        R_seen=np.zeros((0, 3, 3)),
-        p_seen_m=np.zeros((0, 3)),
-        cov_seen=np.zeros((0, 6, 6)),
-    )
