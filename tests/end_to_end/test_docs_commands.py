@@ -4,18 +4,15 @@ import ast
 import doctest
 import importlib
 import re
-import shlex
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
 import typer.main
+from page_commands import FENCE, PREFIX, ROOT, commands_on, words_of
 
 from bricktrack_device.cli import app as device_app
 from bricktrack_host.cli.main import app as host_app
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = [
     ROOT / "README.md",
     *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts),
@@ -25,49 +22,8 @@ PROGRAMS = {
     "bricktrackd": typer.main.get_command(device_app),
 }
 
-# A fenced block, whatever it is indented by; or a span of code within a line.
-_FENCE = re.compile(r"^( *)(`{3,})([^\n]*)\n(.*?)^\1\2`* *$", flags=re.M | re.S)
-_INDENTED = re.compile(r"^ {4,}(?:\$ )?(bricktrackd? .*)$", flags=re.M)
-_SPAN = re.compile(r"(?<!`)`(bricktrackd? [^`]+)`(?!`)")
-_PREFIX = re.compile(r"^(\$ )?(sudo (-u \w+ )?)?(/[\w./-]*/)?(?=bricktrackd? )")
 # What stands for something else, in commands that show a form and not a case.
 _PLACEHOLDER = re.compile(r"^(\.\.\.|…|[A-Z_]{2,}|<.*>|\[.*\])$")
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command as a page gives it; ``whole`` if it is meant to be typed as it stands."""
-
-    page: str
-    text: str
-    whole: bool
-
-
-def commands_on(page: str, text: str) -> list[Command]:
-    """Return the commands of a page: those of its blocks, and those named in its sentences."""
-    found = []
-    for fence in _FENCE.finditer(text):
-        language, block = fence[3].strip(), fence[4].replace("\\\n", " ")
-        if language in {"console", "shell", "sh", "bash"}:
-            lines = [_PREFIX.sub("", line.strip()) for line in block.splitlines()]
-            found += [Command(page, line, True) for line in lines if re.match(r"bricktrackd? \S", line)]
-    rest = _FENCE.sub("", text)
-    found += [Command(page, match[1], True) for match in _INDENTED.finditer(rest)]
-    found += [Command(page, " ".join(m[1].split()), False) for m in _SPAN.finditer(rest)]
-    return found
-
-
-def words_of(text: str) -> list[str]:
-    """Return the words of one command: to the first pipe, comment or other end that a shell sees."""
-    lexer = shlex.shlex(text, posix=True, punctuation_chars="|;&<>()")
-    lexer.whitespace_split = True
-    lexer.commenters = "#"
-    words = []
-    for word in lexer:
-        if re.fullmatch(r"[|;&<>()]+", word):
-            break
-        words.append(word)
-    return words
 
 
 def why_refused(words: list[str], *, whole: bool) -> str | None:
@@ -161,7 +117,7 @@ def test_the_examples_in_a_help_text_are_commands_the_program_takes(path):
     command = LEAVES[path]
     text = "\n\n".join(filter(None, (command.help, command.epilog)))
     paragraphs = [
-        _PREFIX.sub("", " ".join(part.replace("\\\n", " ").split())) for part in re.split(r"\n\s*\n", text)
+        PREFIX.sub("", " ".join(part.replace("\\\n", " ").split())) for part in re.split(r"\n\s*\n", text)
     ]
     examples = [part for part in paragraphs if re.match(r"bricktrackd? [^ ]", part)]
     assert examples, f"'{path} --help' shows no example"
@@ -220,7 +176,7 @@ def test_commands_are_found_in_a_page(text, expected):
 def _python_blocks() -> list[tuple[str, str]]:
     blocks = []
     for page in PAGES:
-        for fence in _FENCE.finditer(page.read_text()):
+        for fence in FENCE.finditer(page.read_text()):
             if fence[3].strip() in {"python", "py"}:
                 blocks.append((str(page.relative_to(ROOT)), fence[4]))
     return blocks
@@ -263,7 +219,7 @@ def test_messages_in_troubleshooting_are_ones_the_programs_print():
 def test_what_a_session_on_a_page_prints_is_what_the_code_prints():
     n_tried = 0
     for page in PAGES:
-        for fence in _FENCE.finditer(page.read_text()):
+        for fence in FENCE.finditer(page.read_text()):
             if fence[3].strip() == "pycon":
                 name = str(page.relative_to(ROOT))
                 session = doctest.DocTestParser().get_doctest(fence[4], {}, name, name, 0)
