@@ -3,6 +3,7 @@
 `msgspec` does the checking; this module turns its words into ours, with the file and the key.
 """
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +13,15 @@ import msgspec
 from bricktrack_common.errors import BricktrackError, ConfigError, RunFormatError
 
 T = TypeVar("T")
+
+_OUR_WORDS = (
+    (re.compile(r"Object missing required field `(\w+)`"), r"required field '\1' is missing"),
+    (re.compile(r"Object contains unknown field `(\w+)`"), r"unknown field '\1'; is it misspelt?"),
+    (
+        re.compile(r"Expected `str` matching regex '\^\[A-Za-z0-9\]\[A-Za-z0-9_\.-\]\{0,99\}\$'"),
+        "expected letters, digits, '-', '_' and '.', a letter or digit first",
+    ),
+)
 
 
 def convert(data: object, kind: type[T], *, where: str, error: type[BricktrackError]) -> T:
@@ -34,6 +44,8 @@ def convert(data: object, kind: type[T], *, where: str, error: type[BricktrackEr
         text = str(e)
         problem, _, key = text.partition(" - at `")
         key = key.rstrip("`").removeprefix("$.").removeprefix("$")
+        for msgspecs, ours in _OUR_WORDS:
+            problem = msgspecs.sub(ours, problem)
         raise error(f"{where}: {key + ': ' if key else ''}{problem}") from e
 
 
@@ -47,7 +59,7 @@ def load_toml(path: Path, kind: type[T]) -> T:
         names the file and the key path.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows begin with a mark
     except OSError as e:
         raise ConfigError(f"{path}: {e.strerror or e}") from e
     except UnicodeDecodeError as e:
