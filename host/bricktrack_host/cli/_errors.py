@@ -1,5 +1,6 @@
 """How the command line ends: an error is one red line, an interruption one line, a bug its traceback."""
 
+from math import isfinite
 from typing import Any
 
 import typer
@@ -19,6 +20,8 @@ class BricktrackGroup(TyperGroup):
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
         tidy_help(self)
+        for command in self.commands.values():
+            take_finite_numbers_only(command)
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; exit with 1 after a `BricktrackError`, with 130 after Ctrl-C."""
@@ -30,3 +33,23 @@ class BricktrackGroup(TyperGroup):
         except KeyboardInterrupt as e:
             err.print(str(e) or "Interrupted.", style="yellow", markup=False)
             raise typer.Exit(EXIT_INTERRUPTED) from e
+
+
+def take_finite_numbers_only(command: Any) -> None:
+    """Have a command, or those below a group, refuse "nan" and "inf", which pass every limit of an option."""
+    children = getattr(command, "commands", None)
+    if children is not None:
+        for child in children.values():
+            take_finite_numbers_only(child)
+        return
+    invoke = command.invoke
+
+    def checked(context: Any) -> Any:
+        for parameter in command.params:
+            value = context.params.get(parameter.name)
+            for number in value if isinstance(value, (list, tuple)) else (value,):
+                if isinstance(number, float) and not isfinite(number):
+                    raise typer.BadParameter(f"{number} is no finite number", ctx=context, param=parameter)
+        return invoke(context)
+
+    command.invoke = checked

@@ -90,6 +90,21 @@ def test_what_is_shown_otherwise_is_taken_as_before():
     assert CliRunner().invoke(_small_app(), ["turn", "--rate", "61"]).exit_code == 2
 
 
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize(
+    "before",
+    [
+        ["calibrate", "fit", "-o", "c.json", "--a-mm"],
+        ["target", "-o", "t.pdf", "--planes-mm", "100"],
+        ["arm", "--duration"],
+    ],
+)
+def test_what_is_no_number_is_refused_before_anything_is_done(before, number):
+    done = CliRunner().invoke(bricktrack, [*before, number])
+    assert done.exit_code == 2
+    assert before[-1 if before[-1].startswith("-") else -2] in done.output
+
+
 def test_a_shell_takes_an_example_as_it_is_shown():
     words = ["--picture", "101.117=near.png", "--picture", "161.111=far.png", "--origin-near", "960", "540"]
     example = flowing(" ".join(["bricktrack", "calibrate", "fit", *words]))
