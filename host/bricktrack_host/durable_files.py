@@ -129,6 +129,21 @@ def _next_beside(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}_{taken[-1][0] + 1 if taken else 1}")
 
 
+def require_writable(folder: Path, remedy: str) -> None:
+    """Make sure, before long work, that its results can be put into a folder, which need not exist yet.
+
+    Raises
+    ------
+    StorageError
+        If the folder, or the nearest one above it that exists, is none or cannot be written; with the remedy.
+    """
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise StorageError(f"{there}: is a file, where a folder is expected. {remedy}")
+    if not os.access(there, os.W_OK | os.X_OK):  # asks the file system too, which may be mounted read-only
+        raise StorageError(f"{there}: cannot be written. {remedy}")
+
+
 @contextmanager
 def storage_errors(path: Path, remedy: str) -> Iterator[None]:
     """Turn an `OSError` of the disk into a `StorageError` that names the path and the remedy."""

@@ -31,6 +31,7 @@ from bricktrack_host.calibration.rays.ray_uncertainty import CHI_95
 from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance
 from bricktrack_host.cli._calibration_inputs import FitJob, observe_job
 from bricktrack_host.cli._console import err
+from bricktrack_host.durable_files import require_writable
 
 MAX_ORDER = 15
 WARN_BELOW_COVERED = 0.8
@@ -87,7 +88,10 @@ def run_fit(
     job: FitJob, options: FitOptions, *, mode: SensorMode, unit: str, focus_note: str, output: Path
 ) -> None:
     """Measure, fit, save and report."""
-    # Read first: a wrong name is told before the work.
+    # Looked at first: a wrong name is told before the work.
+    if not output.parent.is_dir():
+        raise ConfigError(f"{output}: there is no folder {output.parent}. Make it, or name another with -o")
+    require_writable(output.parent, "The calibration goes there; name another folder with -o")
     earlier = load_calibration(options.earlier) if options.earlier is not None else None
     brick = load_brick_model(options.layout) if options.layout is not None else None
     if earlier is not None:

@@ -24,6 +24,7 @@ from bricktrack_host.cli import calibrate
 from bricktrack_host.cli._console import err, out
 from bricktrack_host.cli._processed import say_processed
 from bricktrack_host.cli._stage_bar import stage_bar
+from bricktrack_host.durable_files import require_writable
 from bricktrack_host.transfer.fleet_config import load_fleet
 from bricktrack_host.transfer.unit_client import UnitClient
 
@@ -137,6 +138,7 @@ def _say(text: str) -> None:
 
 def _prepare(folder: Path) -> None:
     """Make an empty folder, or replace an earlier demo; never touch anything else."""
+    require_writable(folder, "Name another with --folder")
     if folder.exists() and any(folder.iterdir()):
         if not (folder / _MARKER).is_file():
             raise ConfigError(f"{folder} is not empty and holds no earlier demo; name another with --folder")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
+from bricktrack_host.durable_files import require_writable
 from bricktrack_host.many_runs.one_at_a_time import alone_with
 from bricktrack_host.many_runs.processing_record import (
     ProcessingRecord,
@@ -119,10 +120,13 @@ def process_job(job: RunJob, input_sha256: str, progress: RunProgress) -> RunSum
     ------
     ConfigError
         If another command is at it.
+    StorageError
+        If the results folder cannot be written: at once.
     BricktrackError
         As `pipeline.process_run`.
     """
     watch = Stopwatch()
+    require_writable(job.results, "Results go there; name another folder with -o")
     with alone_with(job.run):
         processed = process_run(
             job.run, calibration=job.calibration, layout=job.layout, output=job.output, settings=job.settings,

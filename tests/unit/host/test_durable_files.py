@@ -1,0 +1,27 @@
+"""Whether a folder can be written is told before the work."""
+
+import pytest
+
+from bricktrack_common.errors import StorageError
+from bricktrack_host import durable_files
+from bricktrack_host.durable_files import require_writable
+
+
+def test_a_folder_that_can_be_made_or_written_is_taken(tmp_path):
+    require_writable(tmp_path, "")
+    require_writable(tmp_path / "not" / "yet", "")
+    assert not (tmp_path / "not").exists()
+
+
+def test_a_file_in_the_way_is_named_with_the_remedy(tmp_path):
+    (tmp_path / "runs").write_text("no folder")
+    for folder in (tmp_path / "runs", tmp_path / "runs" / "b7" / "results"):
+        with pytest.raises(StorageError, match=rf"{tmp_path}/runs: is a file.*Name another"):
+            require_writable(folder, "Name another")
+
+
+def test_a_folder_of_another_or_a_read_only_disk_is_named(tmp_path, monkeypatch):
+    # Tests may run as root, who may write anywhere but on a disk that is mounted read-only.
+    monkeypatch.setattr(durable_files.os, "access", lambda path, mode: False)
+    with pytest.raises(StorageError, match=rf"{tmp_path}: cannot be written. Name another"):
+        require_writable(tmp_path / "results", "Name another")
