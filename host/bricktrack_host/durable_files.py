@@ -94,7 +94,11 @@ def write_folder_whole(
             if leftover.exists():
                 shutil.rmtree(leftover)
         partial.mkdir(parents=True)
-        write(partial)
+        try:
+            write(partial)
+        except OSError:  # of a full disk, perhaps: the part takes room, and is good for nothing
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
         is_kept = folder.exists() and keep_if is not None and keep_if(partial, folder)
         if folder.exists() and keep_if is not None and not is_kept:
             for path in folder.iterdir():

@@ -1,10 +1,22 @@
-"""Whether a folder can be written is told before the work."""
+"""Whether a folder can be written is told before the work, and a part of it is never left."""
+
+import errno
 
 import pytest
 
 from bricktrack_common.errors import StorageError
 from bricktrack_host import durable_files
-from bricktrack_host.durable_files import require_writable
+from bricktrack_host.durable_files import require_writable, write_folder_whole
+
+
+def test_nothing_is_left_where_the_disk_is_full(tmp_path):
+    def write(partial):
+        (partial / "fused.csv").write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(StorageError, match="no space left.*make room"):
+        write_folder_whole(tmp_path / "results", write, marker="summary.json")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_can_be_made_or_written_is_taken(tmp_path):
