@@ -40,6 +40,7 @@ LEVER_ARM_MM = (26.045, 53.000, 14.199)
 CAMERA_EPOCH_NS = 1_000_000_000_000  # what the camera's clock says at the recording's t = 0
 GYRO_LAG_S = 4.19e-3
 ACC_LAG_S = 2.53e-3
+CHI2_3_MEDIAN = 2.366
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,8 @@ def reference_sd(
     """Return the sd of the reference's own error, shape (6,), rad and mm an axis.
 
     Rotation: the reference less the gyro at its native rate, integrated, above 5 Hz, where the gyro is good
-    to 1e-5 rad. Position: what moves above 15 Hz, which a hand does not.
+    to 1e-5 rad. Position: what moves above 15 Hz, which a hand does not. By the median of squares: where the
+    reference jumps for a frame or some, the frames made of it jump too, and what is fused of them says so.
     """
     native_hz = 1 / np.median(np.diff(t_s))
     angle = CubicSpline(t_gyro, gyro).antiderivative()(t_s)
@@ -112,7 +114,8 @@ def reference_sd(
     def above(values: FloatArray, hz: float) -> float:
         b, a = butter(3, hz, btype="high", fs=native_hz)
         inner = slice(round(0.5 * native_hz), -round(0.5 * native_hz))
-        return float(np.sqrt(np.mean(filtfilt(b, a, values, axis=0)[inner] ** 2)))
+        squared = (filtfilt(b, a, values, axis=0)[inner] ** 2).sum(axis=1)
+        return float(np.sqrt(np.median(squared) / CHI2_3_MEDIAN))
 
     return np.repeat([above(off, 5.0), above(origin_mm, 15.0)], 3)
 

@@ -18,7 +18,8 @@ class FusionSettings:
         Scale and cross-axis errors that stand still, and are estimated with the run (data sheet: 1 %; zero:
         none).
     lever_arm_sd_mm : float
-        How well the IMU's place in the brick is known.
+        How well the IMU's place in the brick is known: to a millimetre as it is glued in, and to another
+        within its case. It is estimated with the run.
     systematic_time_s : float
         How long errors by scale and lever arm keep their sign: about a tenth of a second at 2-10 Hz.
     roughness_share : float
@@ -32,7 +33,7 @@ class FusionSettings:
         What turns the brick also shoves it, were it missed by the accelerometer: change of velocity over
         change of angular rate.
     adapt_noise : bool
-        Whether each run chooses its share of roughness and its multiple of the systematic errors by the
+        Whether each run chooses its shares of roughness and its multiples of the systematic errors by the
         likelihood of its frames.
     gyro_bias_walk_radps, acc_bias_walk_mps2 : float
         Wander of the biases in one second.
@@ -67,7 +68,7 @@ class FusionSettings:
     gyro_scale_sd: float = 0.004
     acc_scale_sd: float = 0.004
     sensor_gain_sd: float = 0.01
-    lever_arm_sd_mm: float = 1.0
+    lever_arm_sd_mm: float = 2.0
     systematic_time_s: float = 0.1
     roughness_share: float = 1.0
     gyro_impact_share: float = 0.3

@@ -1,6 +1,7 @@
 """How far frames and inertial samples are to be believed, found from how well they agree."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem
 
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
 _LEAST_SYSTEMATIC, _MOST_SYSTEMATIC = -4, 2  # steps: from a fortieth of what is stated to six times that
+_LEAST_ROUGH = -4
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
 _MAX_SCALE_ROUNDS = 4
 _SCALE_STANDS = 1.25
@@ -162,6 +164,49 @@ def _settled_scale(scale: FloatArray, done: bool) -> FloatArray:
     return np.where(done & (scale < _CLEARLY_LESS), less, np.maximum(scale, 1.0))
 
 
+class _Steps(NamedTuple):
+    """How many steps the noise of a run lies away from what is stated."""
+
+    acc_rough: int = 0
+    gyro_rough: int = 0
+    acc_systematic: int = 0
+    gyro_systematic: int = 0
+
+    def moved(self, way: "_Steps", sign: int) -> "_Steps":
+        """Return those one step farther along a way."""
+        return _Steps(*(n + sign * step for n, step in zip(self, way, strict=True)))
+
+    def is_allowed(self) -> bool:
+        """Return whether roughness and systematic errors lie within what is ever believed."""
+        return all(_LEAST_ROUGH <= n <= 0 for n in self[:2]) and all(
+            _LEAST_SYSTEMATIC <= n <= _MOST_SYSTEMATIC for n in self[2:]
+        )
+
+    def price(self) -> float:
+        """Return the log-likelihood to be earned; systematic errors of both that go together count once."""
+        acc, gyro = self.acc_systematic, self.gyro_systematic
+        n = abs(self.acc_rough) + abs(self.gyro_rough) + max(abs(acc), abs(gyro)) + abs(acc - gyro)
+        return _EARN_PER_STEP * n
+
+    def levels(self, settings: FusionSettings) -> tuple[NoiseLevel, NoiseLevel]:
+        """Return the levels of gyro and accelerometer."""
+        share = settings.roughness_share
+        return (
+            NoiseLevel(share * _LEVEL_STEP**self.gyro_rough, _LEVEL_STEP**self.gyro_systematic),
+            NoiseLevel(share * _LEVEL_STEP**self.acc_rough, _LEVEL_STEP**self.acc_systematic),
+        )
+
+
+_NOT_ALLOWED = _Steps(acc_rough=1)
+_WAYS = (
+    _Steps(acc_systematic=1, gyro_systematic=1),
+    _Steps(gyro_systematic=1),
+    _Steps(acc_rough=1),
+    _Steps(gyro_rough=1),
+    _Steps(acc_systematic=1),
+)
+
+
 def _choose_noise(
     problem: Problem, parts: list[NoiseParts], settings: FusionSettings
 ) -> tuple[list[tuple[NoiseLevel, NoiseLevel]], list[FloatArray]]:
@@ -169,44 +214,40 @@ def _choose_noise(
 
     And the last state of the filter that has them, shape (22,).
 
-    The roughness of the accelerometer may count for less than stated, the systematic errors of both sensors
-    for more or less: first these, then that, then these once more. The stated level stands unless another
-    earns its price.
+    The roughness of a sensor may count for less than stated, its systematic errors for more or less. One way
+    after the other is walked step by step, down and else up, as long as each step earns its price.
     """
-    stated = (0, 0, 0)  # steps of the accelerometer's roughness, of its systematic errors, of the gyro's
-    chosen = [stated] * len(parts)
-    scores: list[dict[tuple[int, int, int], float]] = [{} for _ in parts]
-    last: list[dict[tuple[int, int, int], FloatArray]] = [{} for _ in parts]
-    for moves in (
-        [(0, n, n) for n in (0, -1, -2, -3, -4, 1, 2)],
-        [(0, 0, n) for n in (-2, -1, 1, 2, 3)],
-        [(-1, 0, 0), (-2, 0, 0), (-3, 0, 0), (-4, 0, 0)],
-        [(0, n, 0) for n in (-2, -1, 1, 2)],
-    ):
-        tried = [[(i + di, j + dj, k + dk) for di, dj, dk in moves] for i, j, k in chosen]
-        shape = (len(parts), len(moves), len(problem.dt_s))
-        gyro, acc = np.zeros(shape), np.zeros(shape)
-        for b, part in enumerate(parts):
-            for n, step in enumerate(tried[b]):
-                of_gyro, of_acc = _levels(step, settings)
-                gyro[b, n, : len(part.gyro_fixed)] = part.gyro(of_gyro)
-                acc[b, n, : len(part.acc_fixed)] = part.acc(of_acc)
-        log_likelihood, ends = score_noise(problem, gyro, acc)
-        for b, steps in enumerate(tried):
-            for n, (i, j, k) in enumerate(steps):
-                if all(_LEAST_SYSTEMATIC <= m <= _MOST_SYSTEMATIC for m in (j, k)):
-                    price = abs(i) + max(abs(j), abs(k)) + abs(j - k)
-                    scores[b][i, j, k] = float(log_likelihood[b, n]) - _EARN_PER_STEP * price
-                    last[b][i, j, k] = ends[b, n]
-        chosen = [max(score, key=score.__getitem__) for score in scores]
-    return [_levels(step, settings) for step in chosen], [last[b][step] for b, step in enumerate(chosen)]
+    chosen = [_Steps()] * len(parts)
+    best, last = _earned(problem, parts, chosen, settings)
+    for way in _WAYS:
+        before = chosen.copy()
+        for sign in (-1, 1):
+            tried = [
+                now.moved(way, sign) if now == then else _NOT_ALLOWED
+                for now, then in zip(chosen, before, strict=True)
+            ]
+            while any(steps.is_allowed() for steps in tried):
+                earned, ends = _earned(problem, parts, tried, settings)
+                for b, steps in enumerate(tried):
+                    if steps.is_allowed() and earned[b] > best[b]:
+                        chosen[b], best[b], last[b] = steps, earned[b], ends[b]
+                        tried[b] = steps.moved(way, sign)
+                    else:
+                        tried[b] = _NOT_ALLOWED
+    return [steps.levels(settings) for steps in chosen], last
 
 
-def _levels(step: tuple[int, int, int], settings: FusionSettings) -> tuple[NoiseLevel, NoiseLevel]:
-    """Return the levels of gyro and accelerometer, so many steps of roughness and systematic errors away."""
-    rough, of_acc, of_gyro = (_LEVEL_STEP**n for n in step)
-    share = settings.roughness_share
-    return NoiseLevel(share, of_gyro), NoiseLevel(share * rough, of_acc)
+def _earned(
+    problem: Problem, parts: list[NoiseParts], steps: list[_Steps], settings: FusionSettings
+) -> tuple[list[float], list[FloatArray]]:
+    """Return what one choice for each run earns beyond its price, and the filter's last states."""
+    gyro, acc = np.zeros((2, len(parts), 1, len(problem.dt_s)))
+    for b, (part, of_run) in enumerate(zip(parts, steps, strict=True)):
+        of_gyro, of_acc = (of_run if of_run.is_allowed() else _Steps()).levels(settings)
+        gyro[b, 0, : len(part.gyro_fixed)] = part.gyro(of_gyro)
+        acc[b, 0, : len(part.acc_fixed)] = part.acc(of_acc)
+    log_likelihood, ends = score_noise(problem, gyro, acc)
+    return [float(v) - s.price() for v, s in zip(log_likelihood[:, 0], steps, strict=True)], list(ends[:, 0])
 
 
 def frames_log_likelihood(run: Run, settings: FusionSettings) -> float:

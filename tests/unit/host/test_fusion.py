@@ -80,9 +80,9 @@ def test_twist_is_the_origins_velocity_and_the_body_rate(shaken):
     inside = has(r.track, PoseFlag.DROPOUT)
     speed = rms_length(s.v_mmps[i])
     assert rms_length((r.track.v_camera_mmps - s.v_mmps[i])[~inside]) < 0.05 * speed
-    # One gyro sample is good to 0.1 deg/s an axis, its scale in a short run to a few parts in a
-    # thousand of 87 deg/s; the rest is interpolation.
-    assert rms_length(r.track.omega_brick_radps - s.omega_radps[i]) < np.radians(0.55)
+    # One gyro sample is good to 0.1 deg/s an axis; its scale, doubted by 1 %, and beside it the arm by 2 mm, is
+    # found in a short run to some six parts in a thousand of 87 deg/s; the rest is interpolation.
+    assert rms_length(r.track.omega_brick_radps - s.omega_radps[i]) < np.radians(0.6)
 
 
 @pytest.mark.parametrize("impacts", [0, 8])
