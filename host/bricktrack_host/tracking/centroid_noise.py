@@ -17,19 +17,13 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
-from bricktrack_common.rotations import matrix_from_rvec
-from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.first_poses import FirstPoses
-from bricktrack_host.tracking.frame_motion import calm_frames, led_times_ns, motion_to_leds
-from bricktrack_host.tracking.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors, frame_errors
 from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
-from bricktrack_host.tracking.refine import OWN_SHARE, LedMotion
 from bricktrack_host.tracks import LedObservations
 
 logger = logging.getLogger(__name__)
 
-_MIN_LEDS = 5
-_MAX_FRAMES = 120
 _PRIOR_DOF = 1.0
 """What the floor, of another camera, counts for beside the residuals' own degrees of freedom."""
 _CLIP_SIGMAS = 3.0
@@ -107,61 +101,35 @@ def measure_noise(
     without what lies beyond three sigmas. The answer is the mean of the inverse chi-square that prior and
     residuals give, which for few residuals is larger than their variance.
     """
-    motion = None
-    if rolling_shutter:
-        t_ns, led_t_ns = led_times_ns(observations, ray_model)
-        motion = motion_to_leds(t_ns, led_t_ns, first.R_camera_brick, first.t_camera_brick_mm)
-    frames = calm_frames(first, motion, min_leds=_MIN_LEDS, at_most=_MAX_FRAMES)
-    if frames.size == 0:
+    errors = frame_errors(observations, first, ray_model, brick_model, rolling_shutter=rolling_shutter)
+    return noise_of(errors, errors.seen)
+
+
+def noise_of(errors: FrameErrors, leds: BoolArray) -> CentroidNoise:
+    """Return the noise that some LEDs of each frame show, (n, n_leds); see `measure_noise`."""
+    enough = np.flatnonzero(leds.sum(axis=1) >= MIN_LEDS)
+    if enough.size == 0:
         return CentroidNoise(FLOOR_SD_PX, float("nan"), 0.0, 0)
-    squares, stated, series = _free_residuals(frames, observations, first, motion, ray_model, brick_model)
+    squares, stated, series = _free_residuals(errors, leds, enough)
     variance = _variance(squares, stated)
-    dof = squares.size / max(frames.size / _independent(series), 1.0)
+    dof = squares.size / max(enough.size / _independent(series), 1.0)
     total = _PRIOR_DOF + dof
     mean = (_PRIOR_DOF * FLOOR_SD_PX**2 + dof * variance) / max(total - 2.0, 1.0)
-    return CentroidNoise(float(np.sqrt(mean)), float(np.sqrt(variance)), float(dof), int(frames.size))
+    return CentroidNoise(float(np.sqrt(mean)), float(np.sqrt(variance)), float(dof), int(enough.size))
 
 
 def _free_residuals(
-    frames: IntArray,
-    observations: LedObservations,
-    first: FirstPoses,
-    motion: LedMotion | None,
-    ray_model: RayModel,
-    brick_model: BrickModel,
+    errors: FrameErrors, leds: BoolArray, frames: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the squares of residuals that no pose explains, their stated variances, and a time series.
 
     The first two have shape (m,); the series (n_frames, n_leds, 2) is of residuals with the pose taken off,
     NaN where an LED is not used.
     """
-    seen = all_finite(first.uv_px[frames])
-    n, n_leds = seen.shape
-    R_led = np.repeat(first.R_camera_brick[frames, None], n_leds, axis=1)
-    t_led = np.repeat(first.t_camera_brick_mm[frames, None], n_leds, axis=1)
-    twist_dt = np.zeros((n, n_leds, 6))
-    if motion is not None:
-        R_led = R_led @ matrix_from_rvec(motion.rvec_brick_rad[frames])
-        t_led = t_led + motion.shift_camera_mm[frames]
-        if motion.twist_sd is not None:
-            twist_dt = motion.dt_s[frames][..., None] * motion.twist_sd[frames][:, None]
-    prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_of(brick_model))
-    error = np.where(seen[..., None], first.uv_px[frames] - prediction.uv_px, 0.0)
-    shift = prediction.model_shift_px
-    pixels = observations.cov_px2[frames] - FLOOR_SD_PX**2 * np.eye(2)
-    own = OWN_SHARE**2 * shift[..., :, None] * shift[..., None, :] + pixels
-    by_twist = J * twist_dt[:, :, None, :]
-    squares, stated, series = [], [], np.full((n, n_leds, 2), np.nan)
-    for pattern in np.unique(seen, axis=0):
-        rows = np.flatnonzero((seen == pattern).all(axis=1))
-        m = 2 * int(pattern.sum())
-        A = J[rows][:, pattern].reshape(len(rows), m, 6)
-        e = error[rows][:, pattern].reshape(len(rows), m)
-        common = shift[rows][:, pattern].reshape(len(rows), m, 1)
-        T = by_twist[rows][:, pattern].reshape(len(rows), m, 6)
-        D = common @ np.swapaxes(common, 1, 2) + T @ np.swapaxes(T, 1, 2)
-        for k in range(m // 2):
-            D[:, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += own[rows][:, pattern][:, k]
+    squares, stated, series = [], [], np.full((frames.size, leds.shape[1], 2), np.nan)
+    for pattern in np.unique(leds[frames], axis=0):
+        rows = np.flatnonzero((leds[frames] == pattern).all(axis=1))
+        e, A, D = errors.of_leds(frames[rows], pattern)
         Q, _ = np.linalg.qr(A, mode="complete")
         K = Q[..., 6:]
         values, vectors = np.linalg.eigh(np.swapaxes(K, 1, 2) @ D @ K)
@@ -169,7 +137,7 @@ def _free_residuals(
         squares.append((z**2).ravel())
         stated.append(np.maximum(values, 0.0).ravel())
         free = (K @ (np.swapaxes(K, 1, 2) @ e[..., None]))[..., 0]
-        block = np.full((len(rows), n_leds, 2), np.nan)
+        block = np.full((len(rows), leds.shape[1], 2), np.nan)
         block[:, pattern] = free.reshape(len(rows), -1, 2)
         series[rows] = block
     return np.concatenate(squares), np.concatenate(stated), series

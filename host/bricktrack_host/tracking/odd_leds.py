@@ -1,0 +1,119 @@
+"""LEDs that are elsewhere than all the others say, in every frame alike: set beside their place, or dirty.
+
+One such LED pulls all poses of a run the same way, by a good part of its own error, and widens what is taken
+for the noise of all. Which one it is shows where the others, without it, agree far better with each other.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import fdtrc
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_host.quality import LedFlag
+from bricktrack_host.tracking.centroid_noise import noise_of
+from bricktrack_host.tracking.first_poses import FirstPoses
+from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors, frame_errors
+from bricktrack_host.tracks import LedObservations
+
+_CHANCE = 1e-4
+_LEAST_PX = 0.15  # what a profile's or a ray's own error may be
+
+
+def with_odd_leds_doubted(
+    observations: LedObservations,
+    first: FirstPoses,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    rolling_shutter: bool = True,
+) -> LedObservations:
+    """Return observations in which LEDs that contradict all the others throughout are doubted by as much.
+
+    Parameters
+    ----------
+    observations : LedObservations
+        With covariances as the segmentation states them.
+    first : FirstPoses
+        Of the same observations.
+    ray_model : RayModel
+    brick_model : BrickModel
+    rolling_shutter : bool
+        False: the frames are taken for instants.
+
+    Returns
+    -------
+    LedObservations
+        Odd LEDs have `LedFlag.OUTLIER`, and the variance that their distance from the others' word is.
+    """
+    errors = frame_errors(observations, first, ray_model, brick_model, rolling_shutter=rolling_shutter)
+    off_px = odd_leds_px(errors)
+    odd = off_px > 0
+    cov = observations.cov_px2 + (off_px**2)[:, None, None] * np.eye(2)
+    flags = np.where(odd & np.isfinite(observations.uv_px[..., 0]), int(LedFlag.OUTLIER), 0)
+    return replace(observations, cov_px2=cov, led_flags=observations.led_flags | flags)
+
+
+def words_on_odd_leds(observations: LedObservations, brick_model: BrickModel) -> list[str]:
+    """Return a line on the odd LEDs of `with_odd_leds_doubted`, if there are any."""
+    odd = ((observations.led_flags & int(LedFlag.OUTLIER)) != 0).any(axis=0)
+    if not odd.any():
+        return []
+    names = ", ".join(np.array(brick_model.led_names)[odd])
+    return [
+        f"LED {names}: elsewhere than all the other LEDs say, in every frame alike, and doubted by as much. "
+        "Check its place in the layout, and whether it is clean"
+    ]
+
+
+def odd_leds_px(errors: FrameErrors) -> FloatArray:
+    """Return how far each LED is from where the others put it, (n_leds,), px; 0 where that may be chance.
+
+    Notes
+    -----
+    With P the weights of what no pose explains, ``(P e)_k`` and ``P_kk`` give an LED's distance from where
+    the others put it, and its covariance. Its square beside the noise of the others follows F. All frames
+    count as one: the error stands. The worst first, while five others remain.
+    """
+    n_leds = errors.seen.shape[1]
+    off_px = np.zeros(n_leds)
+    leds = errors.seen.copy()
+    while True:
+        found = [(k, *_beside_the_others(errors, leds, k)) for k in range(n_leds) if leds[:, k].any()]
+        odd = [
+            (k, px, px / noise_px) for k, px, noise_px, chance in found if chance < _CHANCE and px > _LEAST_PX
+        ]
+        if not odd:
+            return off_px
+        k, px, _ = max(odd, key=lambda each: each[2])
+        off_px[k] = px
+        leds[:, k] = False
+
+
+def _beside_the_others(errors: FrameErrors, leds: BoolArray, k: int) -> tuple[float, float, float]:
+    """Return an LED's distance from where the others put it, their noise, px, and the chance of as much."""
+    others = leds.copy()
+    others[:, k] = False
+    noise = noise_of(errors, others)
+    frames = np.flatnonzero(leds[:, k] & (others.sum(axis=1) >= MIN_LEDS))
+    if frames.size == 0 or noise.n_frames == 0:
+        return 0.0, noise.sd_px, 1.0
+    squares, distances, weights = [], [], []
+    for pattern in np.unique(leds[frames], axis=0):
+        rows = frames[(leds[frames] == pattern).all(axis=1)]
+        e, A, D = errors.of_leds(rows, pattern)
+        W = np.linalg.inv(D + noise.sd_px**2 * np.eye(D.shape[-1]))
+        WA = W @ A
+        P = W - WA @ np.linalg.solve(np.swapaxes(A, 1, 2) @ WA, np.swapaxes(WA, 1, 2))
+        own = slice(2 * int(pattern[:k].sum()), 2 * int(pattern[:k].sum()) + 2)
+        Pe = np.einsum("nij,nj->ni", P[:, own], e)
+        d = np.linalg.solve(P[:, own, own], Pe[..., None])[..., 0]
+        squares.append(np.sum(d * Pe, axis=1))
+        distances.append(np.sum(d**2, axis=1) / 2)
+        weights.append(np.trace(P[:, own, own], axis1=1, axis2=2))
+    statistic = max(float(np.mean(np.concatenate(squares))) / 2, 0.0)
+    chance = float(fdtrc(2.0, max(noise.dof, 1.0), statistic))
+    off_px = np.sqrt(np.average(np.concatenate(distances), weights=np.concatenate(weights)))
+    return float(off_px), noise.sd_px, chance
