@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+from scipy.special import gammaln
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
@@ -32,6 +33,7 @@ from bricktrack_host.tracking.verification import (
 
 MAX_SEARCH_BLOBS = 12
 _RIVAL_EVIDENCE = 5.0  # log likelihood: 150 to one
+_CHANCE_EVIDENCE = float(np.log(1e5))  # an answer is to be wrong in at most one of so many pictures
 _SHOWN_AREA = 0.8  # of its disc: a dome shows between half and all of it
 
 
@@ -59,8 +61,9 @@ def search_correspondences(
     Returns
     -------
     list of Correspondence
-        Ambiguous where another assignment is less than 150 times less likely. Two poses of one assignment
-        are no ambiguity of identity: the poses' stage tells them apart, or says so.
+        Ambiguous where another assignment is less than 150 times less likely, or where among as many
+        assignments as there are one would fit as well by chance: in one of 100,000 pictures, or more. Two
+        poses of one assignment are no ambiguity of identity: the poses' stage tells them apart, or says so.
 
     Raises
     ------
@@ -106,6 +109,9 @@ def search_correspondences(
             out[searched[row]] = no_correspondence(n_leds, "no pose explains four LEDs within the gate")
         elif _has_rival(kept[ranked], evidence):
             out[searched[row]] = no_correspondence(n_leds, "two assignments fit equally well", ambiguous=True)
+        elif evidence[0] < _chance_evidence(len(blobs[row]), kept[best]):
+            reason = f"among {len(blobs[row])} lights, {(kept[best] >= 0).sum()} fit as well by chance"
+            out[searched[row]] = no_correspondence(n_leds, reason, ambiguous=True)
         else:
             original = chosen[row][1]
             answer = np.where(kept[best] >= 0, original[np.maximum(kept[best], 0)], -1)
@@ -121,6 +127,17 @@ def _has_rival(kept: IntArray, evidence: FloatArray) -> bool:
     """
     near = evidence > evidence[0] - _RIVAL_EVIDENCE
     return bool((near & (kept != kept[0]).any(axis=1))[1:].any())
+
+
+def _chance_evidence(n_lights: int, kept: IntArray) -> float:
+    """Return the log likelihood that the best of all assignments of so many LEDs may reach by chance.
+
+    The false ones' likelihood ratios have a mean of one: that of N of them is above x in N / x cases at most.
+    """
+    n_leds, n = len(kept), int((kept >= 0).sum())
+    which_leds = gammaln(n_leds + 1) - gammaln(n + 1) - gammaln(n_leds - n + 1)
+    which_lights = gammaln(n_lights + 1) - gammaln(n_lights - n + 1)
+    return float(which_leds + which_lights) + _CHANCE_EVIDENCE
 
 
 def _likeliest(blobs: Blobs) -> tuple[Blobs, IntArray]:
