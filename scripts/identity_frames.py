@@ -20,6 +20,7 @@ from bricktrack_host.tracking.segment import Blobs
 COLLAR_MM = 0.7
 N_FALSE = 5
 _FALSE_AREA_PX2 = (900.0, 6000.0)
+_APART_PX = 80.0  # an LED's diameter and some: nearer lights run together
 _AREA_SD = 0.1  # of the logarithm: what exposure and threshold make of an outline
 _CHUNK = 2000
 Poses = Callable[[int], tuple[FloatArray, FloatArray]]
@@ -153,7 +154,7 @@ def searched(
         frames = []
         for i in range(m):
             shown = np.sort(rng.permutation(brick.n_leds)[n_hidden:])
-            false = mirrored(R[i], t[i], brick, camera, rng) if mirrors else _anywhere(rng)
+            false = mirrored(R[i], t[i], brick, camera, rng) if mirrors else _anywhere(rng, uv[i, shown])
             frames.append(picture(uv[i], area[i], shown, false, noise_px, rng))
         start = time.process_time()
         found = search_correspondences(
@@ -203,7 +204,7 @@ def tracked(
         for i in range(len(frame_s)):
             if i % 10 == 0:
                 shown = np.sort(rng.permutation(brick.n_leds)[rng.integers(1, 3) :])
-            frames.append(picture(uv[i], area[i], shown, _anywhere(rng), noise_px, rng))
+            frames.append(picture(uv[i], area[i], shown, _anywhere(rng, uv[i, shown]), noise_px, rng))
         start = time.process_time()
         found = identify_run(
             [b for b, _ in frames],
@@ -220,5 +221,11 @@ def tracked(
     return out
 
 
-def _anywhere(rng: np.random.Generator) -> FloatArray:
-    return rng.uniform([20, 20], [1900, 1060], (N_FALSE, 2))
+def _anywhere(rng: np.random.Generator, leds_px: FloatArray) -> FloatArray:
+    """Return places of false lights, shape (N_FALSE, 2), px, that touch no LED shown: they would be one light."""
+    places = np.full((N_FALSE, 2), np.nan)
+    touching = np.ones(N_FALSE, dtype=bool)
+    while touching.any():
+        places[touching] = rng.uniform([20, 20], [1900, 1060], (touching.sum(), 2))
+        touching = (np.linalg.norm(places[:, None] - leds_px, axis=-1) < _APART_PX).any(axis=1)
+    return places
