@@ -27,6 +27,20 @@ def test_help_loads_nothing_that_computes(arguments):
     assert run_python(code).splitlines()[-1] == "[]"
 
 
+def test_ctrl_c_while_the_command_line_loads_ends_without_a_traceback():
+    code = """
+import sys
+class CtrlC:
+    def find_spec(self, name, path=None, target=None):
+        if name == "typer":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, CtrlC())
+import bricktrack_host.cli
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 def test_openblas_has_one_thread_unless_the_caller_says_otherwise():
     code = "import bricktrack_host.cli, os; print(os.environ['OPENBLAS_NUM_THREADS'])"
     assert run_python(code) == "1"
