@@ -128,17 +128,19 @@ class ControlPage:
             )
             self._filter.props("dense outlined clearable").classes("grow")
             shown = ui.button(
-                "All shown", on_click=lambda: self._grid.run_grid_method("selectAll", "filtered")
+                "Choose all shown", on_click=lambda: self._grid.run_grid_method("selectAll", "filtered")
             )
             shown.props('aria-label="All shown: choose these units"')
-            none = ui.button("None", on_click=lambda: self._grid.run_grid_method("deselectAll")).props("flat")
+            none = ui.button("Choose none", on_click=lambda: self._grid.run_grid_method("deselectAll"))
+            none.props("flat")
             none.props('aria-label="None: choose no unit"')
         column = {"sortable": True, "filter": True, "resizable": True}
         self._grid = ui.aggrid(
             {
                 "columnDefs": [
-                    {"field": "name", "headerName": "Unit", "width": 120, "pinned": "left"},
-                    {"field": "state", "headerName": "State", "width": 115},
+                    {"field": "name", "headerName": "Unit", "width": 110, "pinned": "left"},
+                    {"field": "state", "headerName": "State", "width": 110},
+                    {"field": "note", "headerName": "Note", "minWidth": 250, "flex": 1},
                     {"field": "n_runs", "headerName": "Runs", "width": 85, "filter": "agNumberColumnFilter"},
                     {"field": "n_to_pull", "headerName": "To pull", "width": 95,
                      "filter": "agNumberColumnFilter"},
@@ -147,7 +149,6 @@ class ControlPage:
                     {"field": "temperature", "headerName": "°C", "width": 80,
                      "filter": "agNumberColumnFilter"},
                     {"field": "run_id", "headerName": "Run", "width": 190},
-                    {"field": "note", "headerName": "Note", "minWidth": 200, "flex": 1},
                 ],
                 "defaultColDef": column,
                 "rowData": [_row(view) for view in self._views.values()],
