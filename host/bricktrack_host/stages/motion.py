@@ -18,7 +18,8 @@ from bricktrack_host.results.daq_clock import EdgeFit
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.stages.clocks import Inertial
 from bricktrack_host.tracking.first_poses import FirstPoses
-from bricktrack_host.tracking.optical_track import led_motion, solve_poses
+from bricktrack_host.tracking.frame_motion import led_motion, within_exposure_ns
+from bricktrack_host.tracking.optical_track import solve_poses
 from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1
@@ -73,14 +74,15 @@ def retime(
         return optical
     n = len(optical.t_ns)
     for _ in range(_RETIME_PASSES):
-        wanted = np.concatenate([optical.t_ns, optical.led_t_ns.ravel()])
+        within_ns = within_exposure_ns(optical.led_t_ns, observations.exposure_ns)
+        wanted = np.concatenate([optical.t_ns, within_ns.ravel()])
         try:
             track = _by_poses(
                 optical, inertial, brick.imu_lever_arm_mm, wanted, settings=_WITHIN_FRAMES
             ).track
         except (ShapeError, TrackingError):
             return optical  # the fusion itself will say why
-        motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)))
+        motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)), n_instants=2)
         optical = solve_poses(observations, rays, brick, motion=motion, first=first)
         if not np.isfinite(optical.t_camera_brick_mm).any():
             break

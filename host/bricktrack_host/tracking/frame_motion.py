@@ -37,24 +37,49 @@ def led_times_ns(observations: LedObservations, ray_model: RayModel) -> tuple[In
     return centre, first[:, None] + np.rint(mode.row_delay_ns(v)).astype(np.int64)
 
 
-def led_motion(at_frames: FusedTrack, at_leds: FusedTrack) -> LedMotion:
+def within_exposure_ns(led_t_ns: IntArray, exposure_ns: IntArray) -> IntArray:
+    """Return two instants within each LED's exposure at which a motion's mean is that over all of it.
+
+    The points of Gauss's rule: before and after the middle by the exposure over the root of 12.
+
+    Parameters
+    ----------
+    led_t_ns : ndarray of int64, shape (n, n_leds)
+        Mid-exposure.
+    exposure_ns : ndarray of int64, shape (n,)
+
+    Returns
+    -------
+    t_ns : ndarray of int64, shape (2, n, n_leds)
+    """
+    aside = np.rint(exposure_ns / np.sqrt(12.0)).astype(np.int64)[:, None]
+    return np.stack([led_t_ns - aside, led_t_ns + aside])
+
+
+def led_motion(at_frames: FusedTrack, at_leds: FusedTrack, *, n_instants: int = 1) -> LedMotion:
     """Return how the brick moves from the frames' instants to those of the LEDs, by a fused track.
+
+    An LED's light is gathered over an exposure: a brick that turns back meanwhile is seen where it is on the
+    mean, not in the middle. At 10 Hz and 10 ms that is 1.6 % of the amplitude.
 
     Parameters
     ----------
     at_frames : FusedTrack
         At the n instants of the frames.
     at_leds : FusedTrack
-        At the n x n_leds instants of the LEDs, frame by frame.
+        At the instants of the LEDs, frame by frame; or at those of `within_exposure_ns`, in its order.
+    n_instants : int
+        Instants of each LED, whose mean counts: 2 for those of `within_exposure_ns`.
     """
     n = len(at_frames.t_ns)
-    R = at_leds.R_camera_brick.reshape(n, -1, 3, 3)
-    t_mm = at_leds.t_camera_brick_mm.reshape(n, -1, 3)
-    turn = rvec_from_matrix(np.swapaxes(at_frames.R_camera_brick, -1, -2)[:, None] @ R)
+    R = at_leds.R_camera_brick.reshape(n_instants, n, -1, 3, 3)
+    t_mm = at_leds.t_camera_brick_mm.reshape(n_instants, n, -1, 3).mean(axis=0)
+    turn = rvec_from_matrix(np.swapaxes(at_frames.R_camera_brick, -1, -2)[:, None] @ R).mean(axis=0)
+    later_ns = (at_leds.t_ns.reshape(n_instants, n, -1) - at_frames.t_ns[:, None]).mean(axis=0)
     return LedMotion(
         rvec_brick_rad=turn,
         shift_camera_mm=t_mm - at_frames.t_camera_brick_mm[:, None],
-        dt_s=np.asarray((at_leds.t_ns.reshape(n, -1) - at_frames.t_ns[:, None]) * 1e-9, dtype=np.float64),
+        dt_s=np.asarray(later_ns * 1e-9, dtype=np.float64),
         twist_sd=np.tile(_FUSED_TWIST_SD, (n, 1)),
     )
 

@@ -19,7 +19,6 @@ from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.first_poses import FirstPoses, degrees_of_freedom, first_poses
 from bricktrack_host.tracking.frame_motion import (
-    led_motion,
     led_times_ns,
     motion_doubt_px2,
     motion_to_leds,
@@ -32,7 +31,7 @@ from bricktrack_host.tracking.prsoi import PrsoiForm, prsoi_starts
 from bricktrack_host.tracking.refine import MIN_LEDS, LedMotion, RefinedPoses, refine_poses
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
-__all__ = ["SegmentMethod", "led_motion", "led_times_ns", "observe_leds", "solve_poses", "start_poses"]
+__all__ = ["SegmentMethod", "led_times_ns", "observe_leds", "solve_poses", "start_poses"]
 
 _PASSES = 4
 _SETTLED_MM = 1e-3
