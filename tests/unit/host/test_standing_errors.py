@@ -1,0 +1,97 @@
+"""Errors that stand still over a run seen LED by LED, against simulated runs of a unit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from daemon_runs import simulate_run
+
+from bricktrack_common.brick_model import ProfileEntry
+from bricktrack_host.fusion import led_smoothing
+from bricktrack_host.fusion.estimate import FusionInput, prepare_run
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.led_measurements import SeenLeds
+from bricktrack_host.fusion.led_smoothing import smooth_leds
+from bricktrack_host.fusion.pose_level import smooth_poses
+from bricktrack_host.fusion.smoother import POS, Filter
+from bricktrack_host.fusion.standing_errors import StandingWay
+from bricktrack_host.tracking.optical_track import solve_poses
+
+SETTINGS = FusionSettings()
+PROFILE, SIZE, FIRST_LED = 21, 22, 23
+
+
+def smoothed(run):
+    optical = solve_poses(run.observations, run.camera, run.brick)
+    item = FusionInput(optical, run.imu, run.lever_arm_mm, optical.t_ns[5:-5])
+    first = smooth_poses([prepare_run(item, SETTINGS)], SETTINGS)[0]
+    leds = SeenLeds.of(run.observations, run.camera)
+    arm_m = run.lever_arm_mm * 1e-3
+    return smooth_leds(leds, first, run.camera, run.brick, lever_arm_m=arm_m, settings=SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """Return a run without standing errors, and its last pass, with what it was made of."""
+    passes = []
+    whole = led_smoothing._pass
+
+    def keep(*args):
+        passes.append(whole(*args))
+        return passes[-1]
+
+    run = simulate_run(31, duration_s=4.0)
+    run = replace(run, brick=replace(run.brick, led_profile=ProfileEntry(collar_mm=0.7, source="simulated")))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(led_smoothing, "_pass", keep)
+        done = smoothed(run)
+    return done, passes[-1]
+
+
+def test_a_run_without_standing_errors_shows_none(plain):
+    done, _ = plain
+    z = done.errors.value / np.sqrt(np.diagonal(done.errors.covariance))
+    assert np.abs(z[PROFILE:]).max() < 3.5  # 16 of them, about one in 2000 each
+    assert done.errors.offset_sd_px < 0.02  # noise of 0.05 px in 120 frames says little below 0.005
+
+
+def test_the_leds_noise_is_found_where_pictures_move_and_where_they_stand(plain):
+    # Simulated white noise of 0.05 px, as stated, at rest as well.
+    assert plain[0].noise_scales == pytest.approx([1, 1], abs=0.12)
+
+
+def test_the_derivative_of_the_smoothed_motion_is_that_of_the_filter(plain):
+    # An LED seen 0.1 px off all the time. With noise three times what it is nothing surprises the filter, which
+    # would believe it less.
+    done, last = plain
+    now, leds = last.states, last.leds
+    arrays = now.problem.leds._replace(cov_px2=9 * now.problem.leds.cov_px2)
+    problem = replace(now.problem, leds=arrays)
+    passed = Filter(problem)
+    before = passed.smooth()
+    way = StandingWay(problem, passed, leds, last.pictured, 7, of=before.of)
+    sure = np.zeros_like(done.errors.covariance)
+    sure[FIRST_LED + 6, FIRST_LED + 6] = 1.0  # u of the fourth LED, px
+    more = way.with_doubt(before, replace(done.errors, covariance=sure)).covariance[:, 0]
+    found = np.sqrt(np.diagonal(more - before.covariance[:, 0], axis1=1, axis2=2)[:, 3:6])
+    off_px = np.where(leds.led == 3, 0.1, 0.0)[:, None] * [1, 0]
+    moved = replace(problem, leds=arrays._replace(residual_px=arrays.residual_px + off_px))
+    shift_m = np.abs(Filter(moved).smooth().state.x - before.state.x)[:, 0, POS]
+    # Of the largest; each LED moves the state at which the next is linearised.
+    assert np.abs(found - shift_m / 0.1).max() < 0.04 * found.max()
+    assert found.max() > 1e-6
+
+
+def test_an_led_that_is_off_all_the_time_is_found():
+    run = simulate_run(32, duration_s=4.0)
+    uv = run.observations.uv_px.copy()
+    uv[:, 4, 0] += 0.3
+    done = smoothed(replace(run, observations=replace(run.observations, uv_px=uv)))
+    offset = done.errors.value[FIRST_LED:].reshape(7, 2)
+    sd = np.sqrt(np.diagonal(done.errors.covariance))[FIRST_LED:].reshape(7, 2)
+    assert np.argmax(np.abs(offset[:, 0])) == 4
+    # A part of it looks like a pose, which the sd says.
+    assert abs(offset[4, 0] - 0.3) < 3 * sd[4, 0]
+    assert offset[4, 0] > 0.12
+    assert done.errors.offset_sd_px > 0.03
+    assert sd[4, 0] < 0.2
