@@ -1,6 +1,7 @@
 """The command ``bricktrack``: its options and the commands it is made of."""
 
 import importlib.metadata
+import sys
 from typing import Annotated
 
 import typer
@@ -32,7 +33,7 @@ from bricktrack_host.cli import (
     view,
 )
 from bricktrack_host.cli._console import out, set_up_logging
-from bricktrack_host.cli._errors import BricktrackGroup
+from bricktrack_host.cli._errors import EXIT_INTERRUPTED, BricktrackGroup
 from bricktrack_host.cli._processing import process_pulled
 from bricktrack_host.cli.pull import make_pull_command
 
@@ -102,4 +103,7 @@ app.command("demo", rich_help_panel=_JUDGE)(demo.demo)
 
 def main() -> None:
     """Run the command line; see `bricktrack_host.cli._errors` for how it ends."""
-    app(prog_name="bricktrack")
+    try:
+        app(prog_name="bricktrack")
+    except KeyboardInterrupt:  # before a command begins: typer takes its time to read them all
+        sys.exit(EXIT_INTERRUPTED)

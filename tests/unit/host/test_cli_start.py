@@ -27,8 +27,7 @@ def test_help_loads_nothing_that_computes(arguments):
     assert run_python(code).splitlines()[-1] == "[]"
 
 
-def test_ctrl_c_while_the_command_line_loads_ends_without_a_traceback():
-    code = """
+LOADING = """
 import sys
 class CtrlC:
     def find_spec(self, name, path=None, target=None):
@@ -37,6 +36,18 @@ class CtrlC:
 sys.meta_path.insert(0, CtrlC())
 import bricktrack_host.cli
 """
+READING_COMMANDS = """
+import typer.main
+from bricktrack_host.cli import main
+def ctrl_c(app):
+    raise KeyboardInterrupt
+typer.main.get_command = ctrl_c
+main()
+"""
+
+
+@pytest.mark.parametrize("code", [LOADING, READING_COMMANDS])
+def test_ctrl_c_before_a_command_begins_ends_without_a_traceback(code):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "")
 
