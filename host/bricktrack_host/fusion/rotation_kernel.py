@@ -63,7 +63,7 @@ def write_rotation_vector(A: Any, B: Any, out: Any) -> None:
 
 
 @compiled_in_place
-def _times(R: Any, E: Any) -> None:
+def times(R: Any, E: Any) -> None:
     """Replace R by R E, the latter given row by row."""
     for i in range(3):
         a, b, c = R[i, 0], R[i, 1], R[i, 2]
@@ -74,7 +74,7 @@ def _times(R: Any, E: Any) -> None:
 @compiled_in_place
 def turn_by(R: Any, v: Any) -> None:
     """Replace R by R Exp(v)."""
-    _times(R, rotation_of(v[0], v[1], v[2]))
+    times(R, rotation_of(v[0], v[1], v[2]))
 
 
 @compiled_in_place
@@ -82,4 +82,4 @@ def orthonormalise(R: Any) -> None:
     """Take one Newton step back to a rotation."""
     xx, yy, zz = _columns(R, 0, R, 0), _columns(R, 1, R, 1), _columns(R, 2, R, 2)
     xy, xz, yz = -0.5 * _columns(R, 0, R, 1), -0.5 * _columns(R, 0, R, 2), -0.5 * _columns(R, 1, R, 2)
-    _times(R, (1.5 - 0.5 * xx, xy, xz, xy, 1.5 - 0.5 * yy, yz, xz, yz, 1.5 - 0.5 * zz))
+    times(R, (1.5 - 0.5 * xx, xy, xz, xy, 1.5 - 0.5 * yy, yz, xz, yz, 1.5 - 0.5 * zz))
