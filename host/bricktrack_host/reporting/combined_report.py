@@ -97,8 +97,9 @@ def verdict(summary: TestSummary) -> tuple[str, str]:
     """Return one line on the test, and its mood: good, care or bad."""
     moved = sum(len(entry.chains) for entry in summary.assemblies)
     agree = sum(unit.edges in AGREEING for unit in summary.units)
-    seen = _count(moved, "component")
-    said = f"{agree} of {_units(len(summary.units))} on the same samples, {seen} seen from their base"
+    said = f"{agree} of {_units(len(summary.units))} on the same samples"
+    if summary.assemblies:
+        said += f", {_count(moved, 'component')} seen from their base"
     if summary.assemblies and not moved:
         return f"Not usable: {said}.", "bad"
     doubtful = sum(bool(unit.problems) for unit in summary.units)

@@ -127,7 +127,7 @@ def _table_section(pairs: list[Alike]) -> Section:
     rows = []
     for pair in pairs:
         cells = [
-            "–" if pair.n == 0 else f"{high:.3g} / {rms:.2g}"
+            "–" if pair.n == 0 else f"{high:.3g}\N{NO-BREAK SPACE}/ {rms:.2g}"
             for high, rms in zip(pair.largest.tolist(), pair.rms.tolist(), strict=True)
         ]
         in_sd = "–" if pair.n == 0 else f"{float(np.nan_to_num(pair.in_sd).max()):.2g}"

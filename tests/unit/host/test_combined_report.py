@@ -108,6 +108,8 @@ def test_problems_come_first_and_set_the_mood(folder):
     assert verdict(msgspec.structs.replace(test.summary, units=calm)) == (
         "No problem found: 2 of 2 units on the same samples, 2 components seen from their base.", "good",
     )  # fmt: skip
+    alone = msgspec.structs.replace(test.summary, units=calm, assemblies=[])
+    assert verdict(alone) == ("No problem found: 2 of 2 units on the same samples.", "good")
     doubted = [msgspec.structs.replace(calm[0], problems=["video: cut"]), calm[1]]
     line, mood = verdict(msgspec.structs.replace(test.summary, units=doubted))
     assert (line.endswith("1 unit with points of its own."), mood) == (True, "care")
