@@ -24,6 +24,7 @@ logger = logging.getLogger(__name__)
 _EARN = 45.0  # chi-square that a saw-tooth must earn; the best of 50 000 by chance earns some 22
 RATE_SD = 2e-4  # of a clock that was found, before the attitudes have told its skew
 _RATE_STEP = 2e-5
+_ANY_RATE_SD = 0.01  # of stamps whose own clock is wrong
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,12 +129,17 @@ def find_sample_clock(
     way, _, fit = best
     way = replace(way, rate=way.rate - fit.skew)
     best = best_of(search.ways(way, rate_sd=_RATE_STEP)) or best
-    fit = best[2]
-    if not search.has_repeats and as_read.misfit - fit.misfit < _EARN * fit.residual_sd**2:
-        return None
+    _, clock, fit = best
+    if not search.has_repeats:
+        # Stamps at a wrong rate are a straight line and no saw-tooth, and so is one that never wraps.
+        read = np.flatnonzero((imu.flags & int(UNUSABLE)) == 0)
+        line = RotationFit(t_s, R, sd_rad, signal, skew_prior_sd=_ANY_RATE_SD).solve(offset_s) or as_read
+        left = min(as_read.misfit, line.misfit) - fit.misfit
+        if left < _EARN * fit.residual_sd**2 or (np.diff(clock.sample[read]) == np.diff(read)).all():
+            return None
     logger.info(
         "the inertial sensor samples by its own clock, %.0f ppm slow; %d samples were not read",
         best[0].rate * 1e6,
-        best[1].n_skipped,
+        clock.n_skipped,
     )
-    return best[1]
+    return clock

@@ -1,5 +1,7 @@
 """The sensor's own clock, on registers read from the simulated chip, whose clock is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from daemon_runs import EPOCH_NS, simulate_run
@@ -45,6 +47,17 @@ def test_the_chips_clock_is_found_however_late_the_reads(seed, clock_ppm, late_s
 def test_a_clock_that_does_not_beat_is_not_invented():
     run = simulate_run(5, duration_s=8.0, clock_ppm=20.0)
     assert found(run).sample_clock is None
+
+
+@pytest.mark.parametrize("seed", [7, 9])
+def test_stamps_at_a_wrong_rate_are_no_saw_tooth(seed):
+    run = simulate_run(seed, duration_s=8.0, clock_ppm=20.0)
+    t_ns = run.imu.t_ns
+    too_fast = t_ns[0] + np.round((t_ns - t_ns[0]) * 1.001).astype(np.int64)
+    alignment = align_times(
+        solve_poses(run.observations, run.camera, run.brick), replace(run.imu, t_ns=too_fast)
+    )
+    assert alignment.sample_clock is None
 
 
 def test_a_clock_serves_only_the_track_it_was_found_for():
