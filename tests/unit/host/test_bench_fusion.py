@@ -58,6 +58,21 @@ def test_the_references_own_error_is_measured_beside_the_gyro():
     assert sd[3:] == pytest.approx(0.05 * np.sqrt(1 - 15 / 143), rel=0.06)
 
 
+def test_a_range_is_set_by_the_share_of_samples_beyond_it(tmp_path):
+    rng, bench = np.random.default_rng(3), bench_module()
+    t = np.arange(-0.5, 15.5, 0.0035)
+    acc = np.array([0.0, 0.0, 9.8]) + rng.normal(0, 3, (t.size, 3))
+    np.savez(
+        tmp_path / "dev_made.npz", t_mocap=t, p=np.zeros((t.size, 3)), t_gyro=t, gyro=np.zeros((t.size, 3)),
+        q_xyzw=np.broadcast_to([0, 0, 0, 1.0], (t.size, 4)), t_acc=t, acc=acc, imu_in_opt_m=np.zeros(3),
+    )  # fmt: skip
+    case = bench.make_case(tmp_path / "dev_made.npz", seed=0, recipe=bench.Recipe(clip_share=0.05))
+    at_limit = (np.abs(case.imu.acc_mps2) >= case.imu.acc_range_mps2 - 1e-9).any(axis=1)
+    # The limit itself is the sample at that quantile; steps of 0.01 m/s^2 put few others on it.
+    assert at_limit.mean() == pytest.approx(0.05, abs=0.005)
+    assert np.abs(case.imu.acc_mps2).max() <= case.imu.acc_range_mps2 < 20
+
+
 def test_gtsam_finds_the_motion_of_a_simulated_shake(monkeypatch):
     pytest.importorskip("gtsam")
     monkeypatch.setattr(sys, "path", [*sys.path, str(REPOSITORY / "scripts")])
