@@ -23,7 +23,11 @@ if TYPE_CHECKING:
     from bricktrack_host.many_runs.run_job import RunJob, RunSummary
     from bricktrack_host.many_runs.workers import Instead, Workers
 
-_PIPELINE = "bricktrack_host.many_runs.run_job"
+_PRELOADED = (
+    "bricktrack_host.many_runs.run_job",
+    "bricktrack_host.stages.solution",
+    "bricktrack_host.stages.writing",
+)
 
 Send = Literal["auto", "path", "bytes"]
 JobsOption = Annotated[
@@ -100,7 +104,7 @@ class Where:
             from bricktrack_host.many_runs.memory import default_workers
 
             n_workers = self.jobs or default_workers(job.recorded_s() for job in jobs)
-            return LocalProcesses(n_workers, preload=[_PIPELINE])
+            return LocalProcesses(n_workers, preload=_PRELOADED)
         from bricktrack_host.many_runs.dask_cluster import DaskCluster
 
         with err.status(f"asking {self.scheduler} for workers"):
@@ -134,6 +138,7 @@ def process_here(job: "RunJob", *, again: bool) -> None:
     with stage_bar(job.run.name) as bar:
         summary = process_job(job, key, bar)
     say_summary(summary)
+    _tidy_up()
 
 
 def process_folders(runs: list[Path], *, fleet: Path, where: Where) -> int:
@@ -184,7 +189,17 @@ def process_side_by_side(
             todo.append((job, key))
     if standing:
         say_stands(standing)
-    return n_failed + (_process(todo, where) if todo else 0)
+    if todo:
+        n_failed += _process(todo, where)
+        _tidy_up()
+    return n_failed
+
+
+def _tidy_up() -> None:
+    """Remove what earlier versions compiled, once the results stand."""
+    from bricktrack_host.compiled_leftovers import remove_unused_code
+
+    remove_unused_code()
 
 
 def _process(todo: "list[tuple[RunJob, str]]", where: Where) -> int:
