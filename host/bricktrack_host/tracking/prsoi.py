@@ -205,9 +205,15 @@ def _solve_frames(
 ) -> None:
     """Iterate frame by frame; ``which`` is the frame's row of G and H, -1 for a frame without a pose."""
     n, n_leds = seen.shape
-    eps, IJ, R = np.empty(n_leds), np.empty((2, 3)), np.empty((3, 3))
-    dA, BA, kappa = np.empty((n_leds, 2)), np.empty((n_leds, 2)), np.empty((n_leds, 2))
-    new, rotation = np.empty((3, 3)), np.empty((3, 3))
+    R, new, rotation = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    # Of the LEDs that a frame sees beside its reference, without gaps:
+    eps, dA, BA, kappas = (
+        np.empty(n_leds),
+        np.empty((n_leds, 2)),
+        np.empty((n_leds, 2)),
+        np.empty((n_leds, 2)),
+    )
+    Gs, Hs = np.empty((n_leds, 3)), np.empty((n_leds, 3))
     for f in range(n):
         w = which[f]
         if w < 0:
@@ -215,45 +221,43 @@ def _solve_frames(
         reference = 0
         while not seen[f, reference]:
             reference += 1
-        _differences(A, B, f, reference, seen, printed, dA, BA, kappa)
+        n_others, kappa = _differences(A, B, G, H, f, w, reference, seen, dA, BA, Gs, Hs, kappas)
         eps[:] = 0.0
         m, change, rounds = 0.0, np.inf, 0
         while change > tolerance_mm and rounds < max_iterations:
-            IJ[:] = 0.0
-            for k in range(n_leds):
-                if seen[f, k] and k != reference:
-                    for axis in range(2):
-                        x = dA[k, axis]
-                        if rounds:
-                            x += BA[k, axis] * eps[k] / ((b - m) + (m - a) * kappa[k, axis])
-                        for c in range(3):
-                            IJ[axis, c] += H[w, c, k] * x
-            length_i = math.sqrt(IJ[0, 0] ** 2 + IJ[0, 1] ** 2 + IJ[0, 2] ** 2)
-            length_j = math.sqrt(IJ[1, 0] ** 2 + IJ[1, 1] ** 2 + IJ[1, 2] ** 2)
-            s = math.sqrt(length_i * length_j)
-            for c in range(3):
-                R[0, c], R[1, c] = IJ[0, c] / s, IJ[1, c] / s
-            for c in range(3):
-                p, q = (c + 1) % 3, (c + 2) % 3
-                R[2, c] = cross_sign * (R[0, p] * R[1, q] - R[0, q] * R[1, p])
-            total, n_used, change = 0.0, 0, 0.0
-            for k in range(n_leds):
-                if not seen[f, k] or k == reference:
-                    continue
-                for axis in range(2):  # eq. 20; the same for all LEDs and axes but in the printed form
-                    if printed or n_used == 0:
-                        total += ((b - a) / s - b + a * kappa[k, axis]) / (kappa[k, axis] - 1)
-                        n_used += 1
-                depth = R[2, 0] * G[w, k, 0] + R[2, 1] * G[w, k, 1] + R[2, 2] * G[w, k, 2]
-                change = max(change, abs(depth - eps[k])) if math.isfinite(depth) else np.nan
+            per_eps = 1 / ((b - m) + (m - a) * kappa) if rounds else 0.0
+            i0, i1, i2, j0, j1, j2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(n_others):
+                per_x, per_y = per_eps, per_eps
+                if printed:
+                    per_x = 1 / ((b - m) + (m - a) * kappas[k, 0]) if rounds else 0.0
+                    per_y = 1 / ((b - m) + (m - a) * kappas[k, 1]) if rounds else 0.0
+                x, y = dA[k, 0] + BA[k, 0] * eps[k] * per_x, dA[k, 1] + BA[k, 1] * eps[k] * per_y
+                i0, i1, i2 = i0 + Hs[k, 0] * x, i1 + Hs[k, 1] * x, i2 + Hs[k, 2] * x
+                j0, j1, j2 = j0 + Hs[k, 0] * y, j1 + Hs[k, 1] * y, j2 + Hs[k, 2] * y
+            per_s = 1 / math.sqrt(math.sqrt((i0 * i0 + i1 * i1 + i2 * i2) * (j0 * j0 + j1 * j1 + j2 * j2)))
+            i0, i1, i2, j0, j1, j2 = i0 * per_s, i1 * per_s, i2 * per_s, j0 * per_s, j1 * per_s, j2 * per_s
+            k0, k1, k2 = i1 * j2 - i2 * j1, i2 * j0 - i0 * j2, i0 * j1 - i1 * j0
+            change = 0.0
+            for k in range(n_others):
+                depth = cross_sign * (k0 * Gs[k, 0] + k1 * Gs[k, 1] + k2 * Gs[k, 2])
+                change = max(change, abs(depth - eps[k]))
                 eps[k] = depth
-            m = total / n_used
+            m = ((b - a) * per_s - b + a * kappa) / (kappa - 1)
+            if printed:  # eq. 20, over LEDs and axes
+                m = 0.0
+                for k in range(n_others):
+                    for axis in range(2):
+                        m += ((b - a) * per_s - b + a * kappas[k, axis]) / (kappas[k, axis] - 1)
+                m /= 2 * n_others
             rounds += 1
-            if not (math.isfinite(change) and math.isfinite(m)):
+            if not (math.isfinite(k0 + k1 + k2) and math.isfinite(m)):
+                change = np.nan
                 break
+        R[0, 0], R[0, 1], R[0, 2] = i0, i1, i2
+        R[1, 0], R[1, 1], R[1, 2] = j0, j1, j2
+        R[2, 0], R[2, 1], R[2, 2] = k0, k1, k2  # i x j, whatever sign the iteration was asked to take
         count[f] = rounds
-        for c in range(3):  # k = i x j, whatever sign the iteration was asked to take
-            R[2, c] *= cross_sign
         if change <= tolerance_mm and math.isfinite(m) and _nearest_rotation(R, new, rotation):
             converged[f] = True
             along = (m - a) / (b - a)
@@ -268,26 +272,36 @@ def _solve_frames(
 def _differences(
     A: FloatArray,
     B: FloatArray,
+    G: FloatArray,
+    H: FloatArray,
     f: int,
+    w: int,
     reference: int,
     seen: BoolArray,
-    printed: bool,
     dA: FloatArray,
     BA: FloatArray,
-    kappa: FloatArray,
-) -> None:
-    """Fill in a frame's hits on plane a less the reference's, from plane a to b, and their ratio kappa."""
-    both, own = 0.0, 0.0
-    for k in range(len(dA)):
+    Gs: FloatArray,
+    Hs: FloatArray,
+    kappas: FloatArray,
+) -> tuple[int, float]:
+    """Fill in what the LEDs seen beside the reference bring to a frame; return their number and kappa.
+
+    That is hits on plane a less the reference's, what it is from there to plane b, rows of G and H, and the
+    ratio kappa of the hits' distances from the reference on the two planes, LED by LED and axis by axis.
+    """
+    both, own, n_others = 0.0, 0.0, 0
+    for k in range(seen.shape[1]):
         if seen[f, k] and k != reference:
             for axis in range(2):
-                dA[k, axis] = A[f, k, axis] - A[f, reference, axis]
-                BA[k, axis] = B[f, k, axis] - A[f, k, axis]
+                dA[n_others, axis] = A[f, k, axis] - A[f, reference, axis]
+                BA[n_others, axis] = B[f, k, axis] - A[f, k, axis]
                 dB = B[f, k, axis] - B[f, reference, axis]
-                kappa[k, axis] = dB / dA[k, axis]  # eq. 6: one ratio for each LED and axis
-                both, own = both + dA[k, axis] * dB, own + dA[k, axis] ** 2
-    if not printed:
-        kappa[:] = both / own
+                kappas[n_others, axis] = dB / dA[n_others, axis]  # eq. 6
+                both, own = both + dA[n_others, axis] * dB, own + dA[n_others, axis] ** 2
+            for c in range(3):
+                Gs[n_others, c], Hs[n_others, c] = G[w, k, c], H[w, c, k]
+            n_others += 1
+    return n_others, both / own
 
 
 @compiled_in_place
