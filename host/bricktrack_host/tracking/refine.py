@@ -5,6 +5,7 @@ covariance, and taken at the LED's own instant: the caller gives how far the bri
 frame's instant and the LED's.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -110,6 +111,7 @@ def refine_poses(
     motion: LedMotion | None = None,
     max_steps: int = 12,
     profile_is_exact: bool = False,
+    n_threads: int = 1,
 ) -> RefinedPoses:
     """Fit poses to centroids.
 
@@ -130,6 +132,8 @@ def refine_poses(
         Frames stop when their step is a thousandth of their uncertainty; two to four do from PRSOI.
     profile_is_exact : bool
         True: no uncertainty of the profile, for fitting it and for tests.
+    n_threads : int
+        That share the frames of large batches; the poses are the same for any number.
 
     Notes
     -----
@@ -144,28 +148,42 @@ def refine_poses(
             f"centroids have shape {uv_px.shape} and covariances {cov_px2.shape} for "
             f"{brick_model.n_leds} LEDs; expected (n, n_leds, 2) and (n, n_leds, 2, 2)"
         )
-    out = _nothing(n, n_leds)
     seen = all_finite(uv_px) & all_finite(cov_px2, 2)
     started = all_finite(R_start, 2) & all_finite(t_start_mm)
-    frames = np.flatnonzero((seen.sum(axis=1) >= MIN_LEDS) & started)
     model = _model(ray_model, brick_model, collar_mm, profile_is_exact)
     polynomials = hit_polynomials(ray_model)
-    room = room_for(n_leds)
-    for first in range(0, frames.size, _CHUNK_FRAMES):
-        rows = frames[first : first + _CHUNK_FRAMES]
+    out = _started(R_start, t_start_mm, n_leds)
+    out.cost[~started | (seen.sum(axis=1) < MIN_LEDS)] = np.nan
+
+    def fit(first: int) -> None:
+        rows = slice(first, first + _CHUNK_FRAMES)
         observed = _observed(uv_px[rows], cov_px2[rows], seen[rows], polynomials, motion, rows)
-        fitted = _fitted(R_start[rows], t_start_mm[rows], n_leds)
-        fit_frames(observed, model, fitted, room, max_steps)
-        good = np.isfinite(fitted.cost)
-        to = rows[good]
-        out.R_camera_brick[to], out.t_camera_brick_mm[to] = fitted.R[good], fitted.t[good]
-        out.covariance[to], out.chi2[to] = fitted.covariance[good], fitted.cost[good]
-        out.residual_px[to], out.sigmas[to] = fitted.residual[good], fitted.sigmas[good]
-        out.area_px2[to], out.facing[to] = fitted.area[good], fitted.facing[good]
+        fit_frames(observed, model, Fitted(*(field[rows] for field in out)), room_for(n_leds), max_steps)
+
+    firsts = range(0, n, _CHUNK_FRAMES)
+    if n_threads > 1 and len(firsts) > 1:
+        with ThreadPoolExecutor(n_threads) as pool:
+            list(pool.map(fit, firsts))
+    else:
+        for first in firsts:
+            fit(first)
+    missing = ~np.isfinite(out.cost)
+    for field in out:
+        field[missing] = np.nan
     with np.errstate(invalid="ignore"):
-        out.is_outlier[:] = out.sigmas > OUTLIER_SIGMAS
-    out.n_used[:] = (np.isfinite(out.sigmas) & ~out.is_outlier).sum(axis=1)
-    return out
+        is_outlier = np.asarray(out.sigmas > OUTLIER_SIGMAS)
+    return RefinedPoses(
+        R_camera_brick=out.R,
+        t_camera_brick_mm=out.t,
+        covariance=out.covariance,
+        residual_px=out.residual,
+        sigmas=out.sigmas,
+        is_outlier=is_outlier,
+        chi2=out.cost,
+        n_used=np.asarray((np.isfinite(out.sigmas) & ~is_outlier).sum(axis=1), dtype=np.float64),
+        area_px2=out.area,
+        facing=out.facing,
+    )
 
 
 def _model(
@@ -192,13 +210,13 @@ def _observed(
     seen: BoolArray,
     polynomials: HitPolynomials,
     motion: LedMotion | None,
-    rows: IntArray,
+    rows: slice,
 ) -> Observed:
     n, n_leds = seen.shape
     nothing = np.zeros((n, n_leds, 3))
     has_twist = motion is not None and motion.twist_sd is not None
     return Observed(
-        hits=expand_at(polynomials, np.where(seen[..., None], uv, polynomials.half_px)),
+        hits=expand_at(polynomials, np.where(seen[..., None], uv, 0.0)),
         W=_inverse_2x2(np.where(seen[..., None, None], cov, np.eye(2))),
         seen=seen,
         has_motion=motion is not None,
@@ -212,11 +230,11 @@ def _observed(
     )
 
 
-def _fitted(R: FloatArray, t_mm: FloatArray, n_leds: int) -> Fitted:
+def _started(R: FloatArray, t_mm: FloatArray, n_leds: int) -> Fitted:
     n = len(R)
     return Fitted(
-        R=np.array(R, order="C"),
-        t=np.array(t_mm, order="C"),
+        R=np.array(R, dtype=np.float64, order="C"),
+        t=np.array(t_mm, dtype=np.float64, order="C"),
         more=np.zeros((n, N_MORE)),
         covariance=np.empty((n, 6, 6)),
         residual=np.full((n, n_leds, 2), np.nan),
@@ -231,19 +249,3 @@ def _inverse_2x2(C: FloatArray) -> FloatArray:
     det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] * C[..., 1, 0]
     adjugate = np.stack([C[..., 1, 1], -C[..., 0, 1], -C[..., 1, 0], C[..., 0, 0]], axis=-1)
     return np.asarray((adjugate / det[..., None]).reshape(C.shape))
-
-
-def _nothing(n: int, n_leds: int) -> RefinedPoses:
-    nan = np.nan
-    return RefinedPoses(
-        R_camera_brick=np.full((n, 3, 3), nan),
-        t_camera_brick_mm=np.full((n, 3), nan),
-        covariance=np.full((n, 6, 6), nan),
-        residual_px=np.full((n, n_leds, 2), nan),
-        sigmas=np.full((n, n_leds), nan),
-        is_outlier=np.zeros((n, n_leds), dtype=bool),
-        chi2=np.full(n, nan),
-        n_used=np.zeros(n),
-        area_px2=np.full((n, n_leds), nan),
-        facing=np.full((n, n_leds), nan),
-    )

@@ -1,3 +1,5 @@
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from led_scenes import leds_in_camera, lit_outline, polygon_centroid, random_poses, seven_leds
@@ -139,6 +141,18 @@ def test_frames_that_cannot_be_fitted_are_nan_and_leave_the_others_alone():
     poses = refine_poses(uv, cov(4), R_start, t_start, CAMERA, brick, collar_mm=0.7)
     assert np.isfinite(poses.t_camera_brick_mm).all(axis=1).tolist() == [True, False, False, False]
     assert np.isnan(poses.covariance[1:]).all()
+
+
+def test_threads_that_share_a_batch_find_the_poses_that_one_finds():
+    brick = seven_leds(collar_mm=0.7)
+    R, t = random_poses(2500, seed=14)  # three blocks
+    uv = CAMERA.project(leds_in_camera(R, t, brick)).uv_px
+    uv += np.random.default_rng(15).normal(0, SD_PX, uv.shape)
+    uv[1200, 2:] = np.nan
+    one, two = (refine_poses(uv, cov(2500), R, t, CAMERA, brick, collar_mm=0.7, n_threads=k) for k in (1, 2))
+    assert np.isnan(one.chi2).sum() == 1
+    for field in fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
 
 
 def test_wrong_shapes_are_refused():
