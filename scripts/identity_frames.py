@@ -14,7 +14,7 @@ from bricktrack_host.evaluation.true_camera import TrueCamera
 from bricktrack_host.tracking.correspondence import search_correspondences
 from bricktrack_host.tracking.led_identity import identify_run
 from bricktrack_host.tracking.led_profile import outline_moments
-from bricktrack_host.tracking.led_tracker import usual_radius_px
+from bricktrack_host.tracking.run_lights import usual_radius_px
 from bricktrack_host.tracking.segment import Blobs
 
 COLLAR_MM = 0.7

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
@@ -19,7 +20,9 @@ from bricktrack_host.many_runs.workers import RunProgress
 from bricktrack_host.pipeline import ProcessedRun, ProcessSettings, find_truth, process_run
 from bricktrack_host.results.result_store import RESULTS_FOLDER, SUMMARY_NAME
 from bricktrack_host.results.run_summary import key_figures, verdict
-from bricktrack_host.results.truth import TruthComparison
+
+if TYPE_CHECKING:
+    from bricktrack_host.results.truth import TruthComparison
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +90,7 @@ class RunSummary:
     run_id: str
     verdict: str
     problems: tuple[str, ...]
-    truth: TruthComparison | None
+    truth: "TruthComparison | None"
     n_frames: int
     timings_s: dict[str, float]
     folder: Path

@@ -1,6 +1,7 @@
 """What all pages share: the template's environment, key figures, tables of origin, and whole writing."""
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import jinja2
@@ -26,8 +27,9 @@ class OriginTable:
     mono: bool
 
 
+@cache
 def page_environment() -> jinja2.Environment:
-    """Return the environment of the pages' templates: escaped, and strict about names."""
+    """Return the environment of the pages' templates: escaped, strict about names, read once."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("bricktrack_host.reporting"),
         autoescape=True,

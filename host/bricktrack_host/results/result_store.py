@@ -43,6 +43,7 @@ RESULTS_SCHEMA = "bricktrack.results"
 RESULTS_VERSION = 1
 RESULTS_FOLDER = "results"
 SUMMARY_NAME = "summary.json"
+REPORT_NAME = "report.html"
 TIMINGS_NAME = "timings.json"
 
 DetailValue = str | int | float | bool | None | list[str | int | float | bool | None]

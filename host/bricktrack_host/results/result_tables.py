@@ -67,10 +67,9 @@ def led_flag_words(flags: IntArray) -> list[str]:
 
 def _words(flags: IntArray, kind: type[PoseFlag] | type[LedFlag] | type[ImuFlag]) -> list[str]:
     names = [(int(f), (f.name or "").lower()) for f in kind if int(f)]
-    known = {
-        int(value): "|".join(name for bit, name in names if bit & int(value)) for value in np.unique(flags)
-    }
-    return [known[int(value)] for value in flags]
+    values, which = np.unique(flags, return_inverse=True)
+    known = ["|".join(name for bit, name in names if bit & value) for value in values.tolist()]
+    return [known[i] for i in which.tolist()]
 
 
 # Tracks to tables.

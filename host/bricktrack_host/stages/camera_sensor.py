@@ -8,7 +8,7 @@ rising edges that both saw.
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
@@ -18,12 +18,14 @@ from bricktrack_common.errors import ConfigError, RunFormatError
 from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2
 from bricktrack_common.run_folder import Run, read_run
 from bricktrack_common.run_manifest import MANIFEST_NAME, RunManifest, read_manifest
-from bricktrack_host.fusion.moving_camera import CameraImu
 from bricktrack_host.results.daq_clock import EdgeFit, EdgeFitError, fit_edges
 from bricktrack_host.results.daq_table import read_daq_csv
 from bricktrack_host.tracks import ImuTrack
 from bricktrack_host.transfer.camera_config import AccelerationUnit, CameraTableEntry
 from bricktrack_host.transfer.fleet_config import UnitConfig
+
+if TYPE_CHECKING:
+    from bricktrack_host.fusion.moving_camera import CameraImu
 
 _Vector = tuple[float, float, float]
 _SAME_SHAKE_NS = 5_000_000_000  # clocks set by a time server; shakes are minutes apart
@@ -179,7 +181,7 @@ def _seen_from(run: Path, other: Path) -> str:
 
 def read_camera_sensor(
     run: Run, sensor: CameraSensor, edge_fit: EdgeFit | None, problems: list[str]
-) -> CameraImu | None:
+) -> "CameraImu | None":
     """Return the samples of what feels the camera's motion, or `None` and why.
 
     Parameters
@@ -198,6 +200,8 @@ def read_camera_sensor(
     RunFormatError
         If a file cannot be read.
     """
+    from bricktrack_host.fusion.moving_camera import CameraImu
+
     if sensor.kind == "table":
         imu = _table_samples(run, sensor, edge_fit, problems)
     elif sensor.source:

@@ -1,6 +1,7 @@
 """The stage of the pictures: decode, find the LEDs, keep a few for the report."""
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,11 +11,14 @@ from bricktrack_common.errors import VideoError
 from bricktrack_common.frame_times import FrameTimes
 from bricktrack_common.run_folder import Run
 from bricktrack_host.recordings.video_frames import decode_run_video
-from bricktrack_host.reporting.plots import FrameOverlay
 from bricktrack_host.stages.progress import ProcessProgress, Silent
-from bricktrack_host.tracking.optical_track import SegmentMethod, observe_leds
-from bricktrack_host.tracking.segment import Picture, Plane
+from bricktrack_host.tracking.run_lights import find_run_lights
+from bricktrack_host.tracking.segment import Blobs, Picture, Plane
 from bricktrack_host.tracks import LedObservations, OpticalTrack
+
+if TYPE_CHECKING:
+    from bricktrack_host.reporting.plots import FrameOverlay
+    from bricktrack_host.tracking.led_identity import SegmentMethod
 
 FIND = "decode and find LEDs"
 _N_OVERLAYS = 4
@@ -58,18 +62,31 @@ class RunPictures:
             yield frame.index, frame.picture
 
     def observe(
-        self, rays: RayModel, brick: BrickModel, method: SegmentMethod, progress: ProcessProgress
+        self, rays: RayModel, brick: BrickModel, method: "SegmentMethod", progress: ProcessProgress
     ) -> LedObservations:
         """Return the LEDs seen in all pictures."""
-        return observe_leds(
-            self.stream(),
-            rays,
-            brick,
-            sensor_timestamp_ns=self._frames.sensor_timestamp_ns,
-            exposure_ns=self._frames.exposure_us * 1000,
-            method=method,
+        return self.observations(self.lights(rays, brick, method, progress), rays, brick, method)
+
+    def lights(
+        self, rays: RayModel, brick: BrickModel, method: "SegmentMethod", progress: ProcessProgress
+    ) -> list[Blobs | None]:
+        """Return what could be an LED in each picture."""
+        return find_run_lights(
+            self.stream(), rays, brick, n_frames=self._frames.n_frames, method=method,
             progress=progress.advance_to,
-        )
+        )  # fmt: skip
+
+    def observations(
+        self, lights: list[Blobs | None], rays: RayModel, brick: BrickModel, method: "SegmentMethod"
+    ) -> LedObservations:
+        """Return which of the lights are which LEDs."""
+        # Loaded here, because finding the lights need not wait for it; see `pipeline.LOADED_MEANWHILE`.
+        from bricktrack_host.tracking.led_tracker import observe_lights
+
+        return observe_lights(
+            lights, rays, brick, sensor_timestamp_ns=self._frames.sensor_timestamp_ns,
+            exposure_ns=self._frames.exposure_us * 1000, method=method,
+        )  # fmt: skip
 
     def problems(self) -> list[str]:
         """Return what was wrong with the video, in words."""
@@ -78,8 +95,10 @@ class RunPictures:
             for reason, frames in self._lost.items()
         ]
 
-    def overlays(self, observations: LedObservations, optical: OpticalTrack) -> list[FrameOverlay]:
+    def overlays(self, observations: LedObservations, optical: OpticalTrack) -> "list[FrameOverlay]":
         """Return the kept frames with the LEDs as seen and as the pose predicts them."""
+        from bricktrack_host.reporting.plots import FrameOverlay
+
         out = []
         for i, luma in self._kept.items():
             predicted = observations.uv_px[i] - optical.residual_px[i]

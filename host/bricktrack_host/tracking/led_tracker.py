@@ -1,30 +1,26 @@
 """From the pictures of a run to identified centroids.
 
-Each picture is searched decimated, which is cheap and blind to no motion, and every find of an LED's size
-is measured at full resolution; no picture is kept. Then the run is identified (`led_identity`), and the
-areas are compared with what each LED shows in the rest of the run: LEDs partly covered, or run together with
-another light, are flagged.
+The lights of all pictures (`run_lights`) are identified (`led_identity`), and their areas compared with what
+each LED shows in the rest of the run: LEDs partly covered, or run together with another light, are flagged.
 """
 
 import logging
 from collections.abc import Callable, Iterable
-from contextlib import closing
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
-from bricktrack_common.camera_model import RayModel, SensorMode
+from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_identity import SegmentMethod, identify_run
 from bricktrack_host.tracking.led_profile import LedPrediction, collar_of, predict_brick
-from bricktrack_host.tracking.look_ahead import look_ahead
 from bricktrack_host.tracking.run_identities import Identities
-from bricktrack_host.tracking.segment import Blobs, PaperLimits, Picture, find_blobs, paper_filter
+from bricktrack_host.tracking.run_lights import find_run_lights, usual_radius_px
+from bricktrack_host.tracking.segment import Blobs, Picture
 from bricktrack_host.tracking.verification import MIN_INLIERS
 from bricktrack_host.tracks import LedObservations
 
@@ -76,6 +72,34 @@ def observe_leds(
         If the times do not fit each other, a picture's index is outside them or out of order, or its size is
         not that of the calibration.
     """
+    lights = find_run_lights(
+        pictures,
+        ray_model,
+        brick_model,
+        n_frames=np.size(sensor_timestamp_ns),
+        method=method,
+        progress=progress,
+    )
+    return observe_lights(
+        lights,
+        ray_model,
+        brick_model,
+        sensor_timestamp_ns=sensor_timestamp_ns,
+        exposure_ns=exposure_ns,
+        method=method,
+    )
+
+
+def observe_lights(
+    lights: list[Blobs | None],
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    sensor_timestamp_ns: ArrayLike,
+    exposure_ns: ArrayLike,
+    method: SegmentMethod = "default",
+) -> LedObservations:
+    """Identify and judge the lights found in a run by `run_lights.find_run_lights`; see `observe_leds`."""
     stamps = np.asarray(sensor_timestamp_ns, dtype=np.int64)
     exposure = np.asarray(exposure_ns, dtype=np.int64)
     if stamps.ndim != 1 or stamps.shape != exposure.shape:
@@ -83,8 +107,6 @@ def observe_leds(
             f"sensor time stamps have shape {stamps.shape}, exposures {exposure.shape}; expected one of each "
             "a frame"
         )
-    if method not in ("default", "paper"):
-        raise TrackingError(f"segmentation method is {method!r}; expected 'default' or 'paper'")
     n, n_leds = len(stamps), brick_model.n_leds
     out = LedObservations(
         sensor_timestamp_ns=stamps,
@@ -95,20 +117,12 @@ def observe_leds(
         led_flags=np.full((n, n_leds), int(LedFlag.MISSING), dtype=np.int64),
         frame_flags=np.full(n, int(PoseFlag.FRAME_LOST | PoseFlag.NO_POSE), dtype=np.int64),
     )
-    radius_px = usual_radius_px(ray_model, brick_model)
-    find = (
-        partial(paper_filter, limits=PaperLimits.for_radius(radius_px))
-        if method == "paper"
-        else partial(find_blobs, radius_px=radius_px)
-    )
-    with closing(look_ahead(pictures)) as ahead:
-        lights = _find_lights(ahead, find, n, ray_model.sensor_mode, progress)
     found = identify_run(
         lights,
         stamps,
         ray_model,
         brick_model,
-        radius_px=radius_px,
+        radius_px=usual_radius_px(ray_model, brick_model),
         collar_mm=collar_of(brick_model),
         method=method,
     )
@@ -136,33 +150,6 @@ def observe_leds(
     return out
 
 
-def _find_lights(
-    pictures: Iterable[tuple[int, Picture]],
-    find: Callable[[Picture], Blobs],
-    n_frames: int,
-    mode: SensorMode,
-    progress: Callable[[int], None] | None,
-) -> list[Blobs | None]:
-    lights: list[Blobs | None] = [None] * n_frames
-    last = -1
-    for done, (i, picture) in enumerate(pictures, start=1):
-        if not last < i < n_frames:
-            raise TrackingError(
-                f"picture of frame {i} after frame {last}, with {n_frames} time stamps; expected rising "
-                "indices below their number"
-            )
-        if picture.luma.shape != (mode.height, mode.width):
-            raise TrackingError(
-                f"frame {i} has {picture.luma.shape[1]} x {picture.luma.shape[0]} pixels; the calibration is "
-                f"of mode {mode.name}, {mode.width} x {mode.height}. Use the calibration of the run's mode."
-            )
-        last = i
-        lights[i] = find(picture)
-        if progress is not None:
-            progress(done)
-    return lights
-
-
 def _frame_flags(found: Identities, i: int) -> int:
     n_found = int((found.blob_of_led[i] >= 0).sum())
     if n_found == 0:
@@ -170,16 +157,6 @@ def _frame_flags(found: Identities, i: int) -> int:
         return int(PoseFlag.NO_POSE | ambiguous)
     flags = PoseFlag.NONE if n_found == found.blob_of_led.shape[1] else PoseFlag.LED_MISSING
     return int(flags | PoseFlag.UNVERIFIED if n_found == MIN_INLIERS else flags)
-
-
-def usual_radius_px(ray_model: RayModel, brick_model: BrickModel) -> float:
-    """Return the radius of an LED midway between the calibrated planes, at the picture's middle, px."""
-    mode = ray_model.sensor_mode
-    z = 0.5 * (ray_model.plane_a_mm + ray_model.plane_b_mm)
-    middle = np.array([0.5 * (mode.width - 1), 0.5 * (mode.height - 1)])
-    xy = ray_model.points_on_plane(middle, z)
-    J = ray_model.project(np.array([xy[0], xy[1], z])).J_px_per_mm[:, :2]
-    return float(np.median(brick_model.led_radii_mm) * np.sqrt(abs(np.linalg.det(J))))
 
 
 def _flag_areas(

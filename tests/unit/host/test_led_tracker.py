@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.tracking.led_tracker import observe_leds, usual_radius_px
+from bricktrack_host.tracking.led_tracker import observe_leds
 from bricktrack_host.tracking.optical_track import solve_poses
+from bricktrack_host.tracking.run_lights import usual_radius_px
 
 CAMERA = PinholeCamera()
 COLLAR = 0.7

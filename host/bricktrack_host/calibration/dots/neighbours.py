@@ -1,7 +1,6 @@
 """Nearest neighbours among the points of a plane: SciPy's tree behind one typed shape of answer."""
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from bricktrack_common.arrays import FloatArray, IntArray
 
@@ -10,6 +9,8 @@ class Neighbours:
     """Points, shape (n, 2), to be asked for the nearest."""
 
     def __init__(self, points: FloatArray) -> None:
+        from scipy.spatial import cKDTree  # which takes long to load: processing needs none of it
+
         self._tree = cKDTree(points)
 
     def nearest(self, asked: FloatArray, k: int) -> tuple[FloatArray, IntArray]:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import ConvexHull, QhullError
 
 from bricktrack_common.arrays import BoolArray, FloatArray, as_float_array
 from bricktrack_common.errors import CalibrationError
@@ -30,6 +29,11 @@ class ConvexRegion:
         CalibrationError
             If the points have no area.
         """
+        from scipy.spatial import (  # which takes half a second to load: only to calibrate
+            ConvexHull,
+            QhullError,
+        )
+
         try:
             hull = ConvexHull(uv_px)
         except (QhullError, ValueError) as e:

@@ -13,7 +13,7 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from scipy.special import fdtrc, ndtr
+import scipy
 
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
@@ -292,7 +292,7 @@ def _choice(
 def _walk_test(fit: RayFit) -> tuple[float, float]:
     """Return the squared walk in its standard deviations, and its p-value."""
     F = float(fit.parameters[-1] ** 2 / fit.covariance[-1, -1])
-    return F, float(2 * ndtr(-np.sqrt(F)))
+    return F, float(2 * scipy.special.ndtr(-np.sqrt(F)))
 
 
 def centrality_test(planes: Planes, order: int, *, sensor_mode: SensorMode) -> tuple[float, float]:
@@ -320,7 +320,7 @@ def centrality_test(planes: Planes, order: int, *, sensor_mode: SensorMode) -> t
     p_wide, p_central = 4 * n_terms(order), 2 * n_terms(order) + 3
     freedom = 2 * sum(len(dots) for _, dots in planes) - p_wide
     F = max(squares[0] - squares[1], 0.0) / (p_wide - p_central) / (squares[1] / freedom)
-    return F, float(fdtrc(p_wide - p_central, freedom, F))
+    return F, float(scipy.special.fdtrc(p_wide - p_central, freedom, F))
 
 
 def doubted_turns(

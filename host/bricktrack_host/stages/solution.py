@@ -1,0 +1,134 @@
+"""From the LEDs seen to all that the results hold: poses, clocks, motion."""
+
+from pathlib import Path
+
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.checksums import sha256_file
+from bricktrack_common.errors import TrackingError
+from bricktrack_common.run_folder import Run
+from bricktrack_common.run_manifest import MANIFEST_NAME
+from bricktrack_host.calibration.calibration_file import Calibration
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.reporting.fusion_check import TwoFusions
+from bricktrack_host.results.result_store import Provenance, RunResult, software_version
+from bricktrack_host.stages.clocks import align, choose_imu, fit_square_wave, rest_pose, unsure_stamps
+from bricktrack_host.stages.details import alignment_details, calibration_details
+from bricktrack_host.stages.motion import fuse_run, output_grid, retime, with_unsure_times
+from bricktrack_host.stages.progress import Stages
+from bricktrack_host.stages.settings import ProcessSettings
+from bricktrack_host.tracking.centroid_noise import with_measured_noise
+from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.led_fit import with_profile_of_run
+from bricktrack_host.tracking.odd_leds import with_odd_leds_doubted, words_on_odd_leds
+from bricktrack_host.tracking.optical_track import solve_poses, start_poses
+from bricktrack_host.tracks import LedObservations, OpticalTrack
+
+
+def solve_run(
+    run: Run,
+    observations: LedObservations,
+    *,
+    calibration: Calibration,
+    rays: RayModel,
+    brick: BrickModel,
+    settings: ProcessSettings,
+    problems: list[str],
+    stages: Stages,
+    files: tuple[Path, Path],
+) -> tuple[RunResult, TwoFusions | None]:
+    """Return the result of a run, and both fusions where LED by LED was checked against pose by pose.
+
+    Parameters
+    ----------
+    run : Run
+    observations : LedObservations
+        The LEDs seen in its pictures.
+    calibration : Calibration
+    rays : RayModel
+        The calibration's, in the sensor mode of the run.
+    brick : BrickModel
+    settings : ProcessSettings
+    problems : list of str
+        What goes wrong is added in words.
+    stages : Stages
+        Hears which stage begins.
+    files : (Path, Path)
+        The calibration's and the layout's, whose hashes the results hold.
+
+    Raises
+    ------
+    TrackingError
+        If no pose can be believed.
+    """
+    with stages("solve poses"):
+        first = start_poses(observations, rays, brick, form=settings.prsoi_form)
+        brick = with_profile_of_run(
+            observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
+        )
+        observations = with_odd_leds_doubted(
+            observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
+        )
+        problems += words_on_odd_leds(observations, brick)
+        observations = with_measured_noise(
+            observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
+        )
+        optical = solve_poses(
+            observations, rays, brick, rolling_shutter=settings.rolling_shutter, first=first
+        )
+    _require_poses(optical, run, brick)
+    with stages("align clocks"):
+        edge_fit = fit_square_wave(run, problems)
+        imu = choose_imu(run, brick, settings, problems)
+        inertial = None if imu is None else align(optical, imu, run, brick, edge_fit, settings, problems)
+        time_sd_ns = unsure_stamps(observations.sensor_timestamp_ns, optical, inertial, problems)
+        rest = rest_pose(optical, inertial, problems)
+    with stages("fuse"):
+        if settings.rolling_shutter:
+            optical = retime(observations, first, optical, inertial, rays, brick)
+            _require_poses(optical, run, brick)
+        grid = output_grid(optical, inertial, edge_fit)
+        seen = (observations, rays) if settings.rolling_shutter else None
+        fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
+        optical, fused = with_unsure_times(optical, fused, time_sd_ns)
+    result = RunResult(
+        manifest=run.manifest,
+        led_names=brick.led_names,
+        observations=observations,
+        optical=optical,
+        fused=fused,
+        edge_index=grid.edge_index,
+        edge_fit=edge_fit,
+        imu=imu,
+        rest=rest,
+        alignment=alignment_details(inertial, fusion, optical),
+        calibration=calibration_details(calibration),
+        problems=tuple(problems),
+        provenance=Provenance(
+            manifest_sha256=sha256_file(run.folder / MANIFEST_NAME),
+            calibration_sha256=sha256_file(files[0]),
+            layout_sha256=sha256_file(files[1]),
+            software_version=software_version(),
+            settings=settings.facts(),
+        ),
+        timings_s=stages.seconds,
+    )
+    if fusion is None or fusion.pose_level is None:
+        return result, None
+    return result, TwoFusions(fusion.track, fusion.pose_level)
+
+
+def _require_poses(optical: OpticalTrack, run: Run, brick: BrickModel) -> None:
+    """Refuse a run without a pose, or without one that five LEDs agree on: four fit many a wrong layout."""
+    posed = all_finite(optical.t_camera_brick_mm)
+    n = len(optical.t_ns)
+    if not posed.any():
+        raise TrackingError(
+            f"{run.folder.name}: none of {n} frames gave a pose. Look at a picture: "
+            f"are at least 5 of the {brick.n_leds} LEDs lit, sharp and inside it, and is this their layout?"
+        )
+    if (optical.flags[posed] & PoseFlag.UNVERIFIED != 0).all():
+        raise TrackingError(
+            f"{run.folder.name}: in none of {n} frames do five or more LEDs agree on a pose, and four "
+            f"fit many a wrong layout: no pose is believed. Is this the layout of these LEDs?"
+        )
