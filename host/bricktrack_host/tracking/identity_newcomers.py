@@ -8,7 +8,7 @@ neighbouring frames, and how the run moves within the frame.
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.tracking.evidence import log_area_ratio
 from bricktrack_host.tracking.identity_prediction import shown_by_the_rest
 from bricktrack_host.tracking.run_identities import RunIdentities
@@ -16,16 +16,17 @@ from bricktrack_host.tracking.verification import MIN_INLIERS, motion_of
 
 _SURE = 5.0  # log odds that an LED be believed: 150 to one
 _FLEETING = 10.0  # more for one that neither the frame before nor the one after shows
+_AT_END = 3.0  # more in a run's first and last frame, with neighbours on one side
 _STILL = 5.0  # more if the brick must be taken not to move within the frame, though its run does
 _ROUNDS = 3  # false lights in one frame, the worst first
 
 
 def leave_out_fleeting(run: RunIdentities) -> None:
     """Leave out what one frame alone shows, before the run's motion is known: what is true comes again."""
-    frames, leds, needed = _newcomers(run)
-    fleeting = needed > _SURE
-    for led in np.unique(leds[fleeting]):
-        _leave_out(run, frames[fleeting & (leds == led)], np.full(1, led))
+    known, came, gone, _ = _neighbours(run)
+    row, led = np.nonzero(came & gone)
+    for k in np.unique(led):
+        _leave_out(run, known[row[led == k]], np.full(1, k))
 
 
 def leave_out_newcomers(run: RunIdentities, usual_px: FloatArray) -> None:
@@ -36,17 +37,17 @@ def leave_out_newcomers(run: RunIdentities, usual_px: FloatArray) -> None:
     usual_px : ndarray, shape (n,)
         What residuals usually scatter by about each frame.
     """
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS if run.known_frames().size else 0):
         frames, leds, needed = _newcomers(run)
-        if frames.size == 0:
-            return
         for still in (False, True):
+            if frames.size == 0:
+                return
             missing = needed + still * _STILL - log_odds(run, frames, leds, usual_px, still=still)
             doubtful = missing > 0
             frames, leds = frames[doubtful], leds[doubtful]
             needed, missing = needed[doubtful], missing[doubtful]
-            if frames.size == 0:
-                return
+        if frames.size == 0:
+            return
         order = np.lexsort((-missing, frames))
         worst = order[np.unique(frames[order], return_index=True)[1]]
         _leave_out(run, frames[worst], leds[worst])
@@ -54,15 +55,24 @@ def leave_out_newcomers(run: RunIdentities, usual_px: FloatArray) -> None:
 
 def _newcomers(run: RunIdentities) -> tuple[IntArray, IntArray, FloatArray]:
     """Return frames and LEDs whose lights are to be judged, and the log odds that they need."""
+    known, came, gone, lost = _neighbours(run)
+    whole = run.lights_of(known).is_whole  # what is cut is flagged, and used for no pose
+    needed = np.where((came & gone) | lost.any(axis=1, keepdims=True), _SURE + _FLEETING, _SURE)
+    needed[[0, -1]] += np.where((came | gone)[[0, -1]], _AT_END, 0.0)
+    row, led = np.nonzero(whole & (came | gone))
+    return known[row], led, needed[row, led]
+
+
+def _neighbours(run: RunIdentities) -> tuple[IntArray, BoolArray, BoolArray, BoolArray]:
+    """Return the known frames, and which LEDs came, are gone in the next, and are lost from one frame alone.
+
+    What came into a frame that lost another LED may have driven it out.
+    """
     known = run.known_frames()
-    assigned = run.found.blob_of_led[known]
-    has = assigned >= 0
-    lacks_before, lacks_after = np.zeros_like(has), np.zeros_like(has)
-    lacks_before[1:], lacks_after[:-1] = ~has[:-1], ~has[1:]
-    whole = run.lights.of_leds(known, assigned).is_whole  # what is cut is flagged, and used for no pose
-    row, led = np.nonzero(has & whole & (lacks_before | lacks_after))
-    fleeting = (lacks_before & lacks_after)[row, led]
-    return known[row], led, np.where(fleeting, _SURE + _FLEETING, _SURE)
+    has = run.found.blob_of_led[known] >= 0
+    before, after = has.copy(), has.copy()
+    before[1:], after[:-1] = has[:-1], has[1:]
+    return known, has & ~before, has & ~after, before & after & ~has
 
 
 def _leave_out(run: RunIdentities, frames: IntArray, leds: IntArray) -> None:

@@ -206,39 +206,50 @@ def _grow(run: RunIdentities) -> int:
     along, its pose tells where all LEDs are, and no false light.
     """
     n = len(run.blobs)
-    is_tried = run.lights.count < MIN_INLIERS
+    beside = np.stack([np.arange(n) - 1, np.arange(n) + 1], axis=1)
+    inside = np.clip(beside, 0, n - 1)
+    apart_ns = np.abs(run.stamps_ns[inside] - run.stamps_ns[:, None])
+    open_ = (inside == beside) & (apart_ns <= _MAX_COAST_NS) & (run.lights.count >= MIN_INLIERS)[:, None]
     n_grown = 0
     while True:
         known = run.n_found > 0
-        beside = np.stack([np.arange(n) - 1, np.arange(n) + 1], axis=1)
-        inside = np.clip(beside, 0, n - 1)
-        apart_ns = np.abs(run.stamps_ns[inside] - run.stamps_ns[:, None])
-        usable = (inside == beside) & known[inside] & (apart_ns <= _MAX_COAST_NS)
-        usable &= (~known & ~is_tried)[:, None]
-        if not usable.any():
+        frames, side = np.nonzero(open_ & known[inside] & ~known[:, None])
+        if frames.size == 0:
             return n_grown
-        frames, side = np.nonzero(usable)
+        open_[frames, side] = False
         sources = inside[frames, side]
-        seen = run.predict(sources)
-        assigned = np.stack(
-            [
-                assign_predicted(
-                    run.lights.uv_px[slice(*run.lights.first[i : i + 2])],
-                    np.where(facing[:, None] > 0, uv, np.nan),
-                    gate_px=run.radius_px,
-                    shift_limit_px=10 * run.radius_px,
-                )
-                for i, uv, facing in zip(frames, seen.uv_px, seen.facing, strict=True)
-            ]
-        )
+        assigned = _shifted(run, frames, sources)
         start = (run.found.R_camera_brick[sources], run.found.t_camera_brick_mm[sources])
-        verified = _verified(run, run.lights.of_leds(frames, assigned), *start, frames)
+        lights = run.lights.of_leds(frames, assigned)
+        verified = _verified(run, lights, *start, frames)
+        bad = np.flatnonzero(~(verified.poses.chi2 <= _BELIEVED_CHI2))
+        if bad.size:  # a false light may be among them
+            some = lights.take(bad)
+            unknown = unknown_motion(some.uv_px, run.ray_model)
+            again = run.verify(some, (start[0][bad], start[1][bad]), intruders=True, motion=unknown)
+            verified = verified.replaced(bad, again)
         n_kept = np.where(verified.poses.chi2 <= _BELIEVED_CHI2, verified.kept.sum(axis=1), 0)
         order = np.lexsort((-n_kept, frames))
         best = order[np.unique(frames[order], return_index=True)[1]]
-        run.take(frames[best], assigned[best], verified.take(best), n_kept[best] > 0)
-        is_tried[frames[best]] = True
-        n_grown += int((n_kept[best] > 0).sum())
+        best = best[n_kept[best] > 0]
+        run.take(frames[best], assigned[best], verified.take(best))
+        n_grown += best.size
+
+
+def _shifted(run: RunIdentities, frames: IntArray, sources: IntArray) -> IntArray:
+    """Assign the lights of frames to the LEDs as other frames show them, after a common displacement."""
+    seen = run.predict(sources)
+    return np.stack(
+        [
+            assign_predicted(
+                run.lights.uv_px[slice(*run.lights.first[i : i + 2])],
+                np.where(facing[:, None] > 0, uv, np.nan),
+                gate_px=run.radius_px,
+                shift_limit_px=10 * run.radius_px,
+            )
+            for i, uv, facing in zip(frames, seen.uv_px, seen.facing, strict=True)
+        ]
+    )
 
 
 def _complete(run: RunIdentities, frames: IntArray) -> None:

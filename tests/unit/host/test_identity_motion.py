@@ -66,7 +66,6 @@ def test_identities_hold_at_three_tenths_of_a_metre_a_second(calibrated, monkeyp
         np.random.default_rng([1, 11]),
         speed_share=1.0,
     )
-    # One for a false light that falls upon the place of a hidden LED: no picture tells it from the LED.
-    assert found.wrong <= 1
-    # A rigid brick leaves six in ten without all of their LEDs, and some dozen wrong.
-    assert found.right >= 405
+    assert found.wrong == 0
+    # A rigid brick leaves six in ten without all of their LEDs, and some dozen wrong; 99.5 % is this run's kind.
+    assert found.right >= 446
