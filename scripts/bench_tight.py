@@ -10,24 +10,31 @@ Simulated runs of a unit (`tests/support/daemon_runs.py`): chip registers, centr
 
 In the second table the dropouts leave two LEDs of seven: too few for a pose.
 
-Run: ``python scripts/bench_tight.py --seeds 6``
+The third table says whether the motion is as sure as it claims: squared errors over the covariance, by their
+degrees of freedom (NEES/6, 1 when honest), and in how many runs the mean lies in its 95 % band. These runs hold
+errors that stand still too, drawn as widely as is stated of them: LED profile, picture size, single LEDs.
+
+Run: ``python scripts/bench_tight.py --seeds 6``, and ``--honest 20`` for the third table alone
 """
 
 import argparse
 import logging
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from scipy.stats import t as student_t
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from daemon_runs import DaemonRun, simulate_run
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.estimate import fuse
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.quality import PoseFlag
@@ -39,6 +46,8 @@ DROPOUTS = ((3.0, 0.5), (6.0, 0.5))
 SEEN = ("m1", "m5")
 LEDS = ("m0", "m1", "m2", "m3", "m4", "m5", "m6")
 STEP_NS = 5_000_000
+STANDING_PX = 0.01
+CHI2_95 = 12.59  # of 6 degrees of freedom
 Errors = dict[str, tuple[FloatArray, FloatArray]]
 
 
@@ -91,6 +100,73 @@ def errors_of(run: DaemonRun) -> tuple[Errors, BoolArray, BoolArray]:
     return errors, inside, (tight.fused.track.flags & int(PoseFlag.IMPACT)) != 0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Honesty:
+    """Normalised errors, squared (6 degrees of freedom), of one run and method; shape (k,)."""
+
+    since_s: FloatArray
+    squares: FloatArray
+    is_impact: BoolArray
+    is_dropout: BoolArray
+
+    @property
+    def is_within_band(self) -> bool:
+        """Whether the mean is 6 within its 95 % band: stretches of half a second count as independent.
+
+        Their scatter gives the band (Student's t). To claim too little fails as well as to claim too much.
+        """
+        stretch = ((self.since_s - self.since_s[0]) // 0.5).astype(np.int64)
+        means = np.bincount(stretch, self.squares) / np.bincount(stretch)
+        reach = student_t.ppf(0.975, means.size - 1) * means.std(ddof=1) / np.sqrt(means.size)
+        return bool(abs(means.mean() - 6.0) <= reach)
+
+
+def honesty_of(seed: int) -> dict[str, Honesty]:
+    """Return how honest both fusions are on one run of the bench with errors that stand still."""
+    run = simulate_run(
+        seed, duration_s=8.0, amplitude_mm=8.0, amplitude_deg=3.0, impact_mps=0.25, stamp_offset_ns=3_300_000,
+        dropouts=DROPOUTS, standing_px=STANDING_PX,
+    )  # fmt: skip
+    optical = solve_poses(run.observations, run.camera, run.brick)
+    t_ns = np.arange(optical.t_ns[5], optical.t_ns[-5], STEP_NS)
+    R, t_mm = run.truth(t_ns)
+    tight = fuse_tight(
+        run.observations, optical, run.imu, run.camera, run.brick,
+        lever_arm_mm=run.lever_arm_mm, output_t_ns=t_ns,
+    )  # fmt: skip
+    since = run.world.since_first_edge_s(t_ns)
+    is_dropout = np.any([(since > a) & (since < a + d) for a, d in DROPOUTS], axis=0)
+    is_impact = (tight.fused.track.flags & int(PoseFlag.IMPACT)) != 0
+    out = {}
+    for name, found in (("poses", tight.pose_level.track), ("LED by LED", tight.fused.track)):
+        turn = rvec_from_matrix(np.swapaxes(found.R_camera_brick, 1, 2) @ R)
+        error = np.concatenate([turn, t_mm - found.t_camera_brick_mm], axis=1)
+        squares = (error * np.linalg.solve(found.covariance, error[..., None])[..., 0]).sum(axis=1)
+        out[name] = Honesty(since, squares, is_impact, is_dropout)
+    return out
+
+
+def print_honesty(console: Console, runs: list[dict[str, Honesty]]) -> None:
+    """Print a row for each method: NEES/6 by kind of instant, and how many instants and runs are in their bands."""
+    table = Table(title=f"Are {len(runs)} runs as sure as they claim? NEES/6 (simulated)")
+    table.add_column("method")
+    for column in ("quiet", "at impacts", "in dropouts", "all", "instants in 95 %", "runs in their band"):
+        table.add_column(column, justify="right")
+    for name in runs[0]:
+        of = [run[name] for run in runs]
+        squares, impact, dropout = (
+            np.concatenate([getattr(h, field) for h in of])
+            for field in ("squares", "is_impact", "is_dropout")
+        )
+        parts = (~impact & ~dropout, impact & ~dropout, dropout, np.ones(len(squares), dtype=np.bool_))
+        table.add_row(
+            name, *(f"{squares[part].mean() / 6:.2f}" for part in parts),
+            f"{100 * (squares < CHI2_95).mean():.0f} %",
+            f"{sum(h.is_within_band for h in of)} of {len(of)}",
+        )  # fmt: skip
+    console.print(table)
+
+
 def rms(values: list[FloatArray]) -> float:
     """Return the root mean square of squares from several runs; NaN where nothing was given out."""
     squares = np.concatenate(values)
@@ -122,16 +198,20 @@ def print_table(console: Console, title: str, found: list[tuple[Errors, BoolArra
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, default=6, help="runs of each table")
     parser.add_argument("--first-seed", type=int, default=13)
+    parser.add_argument("--honest", type=int, default=0, help="only the third table, of so many runs")
     args = parser.parse_args()
     logging.getLogger("bricktrack_host").setLevel(logging.ERROR)
     console = Console(width=120)
-    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    seeds = range(args.first_seed, args.first_seed + (args.honest or args.seeds))
+    if args.honest:
+        print_honesty(console, [honesty_of(seed) for seed in track(seeds, "simulating", transient=True)])
+        return
     for two_remain, words in (
         (False, "all LEDs hidden in the dropouts"),
         (True, "two LEDs of seven remain in them"),
@@ -139,6 +219,7 @@ def main() -> None:
         runs = track(seeds, words, transient=True)
         found = [errors_of(make_run(seed, two_remain=two_remain)) for seed in runs]
         print_table(console, f"{args.seeds} runs of 8 s, 0.3 m/s (simulated): {words}", found)
+    print_honesty(console, [honesty_of(seed) for seed in track(seeds, "honesty", transient=True)])
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 The inertial samples come from the simulated chip, read burst by burst on a punctual grid that beats with the
 chip's own clock, and are decoded as a run's are. The LEDs are seen by a pinhole camera with distortion, each
-at its own row's mid-exposure, with white noise.
+over its own rows' exposures, with white noise and, where asked for, errors that stand still.
 """
 
 from dataclasses import dataclass
@@ -24,11 +24,13 @@ from bricktrack_device.sim.bno055_chip import Bno055Chip
 from bricktrack_device.sim.imu_signal import ImuSensors, chip_period_s
 from bricktrack_device.sim.settings import HiddenLed, SimImu, SimSettings
 from bricktrack_device.sim.world import SimWorld
-from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.led_profile import LedPrediction, predict_brick
 from bricktrack_host.tracks import ImuTrack, LedObservations
 
 EPOCH_NS = 50_000_000_000
 _COLLAR_MM = 0.7
+_OWN_SHARE = 0.5  # of the profile's doubt, of each LED for itself
+_SIZE_SD = 5e-5
 _FRAME_PERIOD_NS = 33_326_890
 _EXPOSURE_NS = 2_000_000
 _PERIOD_NS = 10_000_000
@@ -85,6 +87,7 @@ def simulate_run(
     acc_range_g: int = 16,
     outlier_share: float = 0.0,
     late_share: float = 0.0,
+    standing_px: float | None = None,
 ) -> DaemonRun:
     """Return one run: a second of rest, a shake, a second of rest.
 
@@ -99,6 +102,9 @@ def simulate_run(
         Of LED centroids that are up to 8 px off.
     late_share : float
         Of inertial reads that an overloaded machine makes up to 35 ms late; slots gone by are skipped.
+    standing_px : float, px, optional
+        Standard deviation of an error of each LED that stands still over the run; with it come those of the
+        LEDs' profile, as the layout states it, and of the picture's size. Without: none of them.
     """
     settings = SimSettings(
         seed=seed,
@@ -126,7 +132,7 @@ def simulate_run(
         R_brick_imu=brick.R_brick_imu,
         led_profile=ProfileEntry(collar_mm=_COLLAR_MM, source="simulated"),
     )
-    observations = _observe(world, camera, brick, rng, duration_s, centroid_sd_px, outlier_share)
+    observations = _observe(world, camera, brick, rng, duration_s, centroid_sd_px, outlier_share, standing_px)
     imu = _sample(world, rng, duration_s, stamp_offset_ns, acc_range_g, late_share)
     return DaemonRun(observations, imu, camera, brick, world, stamp_offset_ns)
 
@@ -139,6 +145,7 @@ def _observe(
     duration_s: float,
     sd_px: float,
     outlier_share: float,
+    standing_px: float | None,
 ) -> LedObservations:
     n = int(duration_s * 1e9 / _FRAME_PERIOD_NS)
     stamp = (
@@ -152,7 +159,10 @@ def _observe(
         pose = R.reshape(n, -1, 3, 3), t_mm.reshape(n, -1, 3)
         prediction, _ = predict_brick(*pose, camera, brick, collar_mm=_COLLAR_MM)
         v = prediction.uv_px[..., 1]
-    uv = prediction.uv_px + rng.normal(0, sd_px, prediction.uv_px.shape)
+    uv = _gathered_px(world, camera, brick, t_ns, prediction.area_px2)
+    uv += rng.normal(0, sd_px, uv.shape)
+    if standing_px is not None:
+        uv += _standing_px(prediction, camera, standing_px, np.random.default_rng([world.settings.seed, 79]))
     far = rng.random(uv.shape[:2]) < outlier_share
     uv[far] += rng.uniform(-8, 8, (int(far.sum()), 2))
     gone = world.leds_hidden(t_ns[:, 0]) | (world.card_cover(t_ns[:, 0]) > 0)[:, None]
@@ -166,6 +176,34 @@ def _observe(
         led_flags=np.zeros(uv.shape[:2], dtype=np.int64),
         frame_flags=np.zeros(n, dtype=np.int64),
     )
+
+
+def _gathered_px(
+    world: SimWorld, camera: PinholeCamera, brick: BrickModel, t_ns: IntArray, area_px2: FloatArray
+) -> FloatArray:
+    """Return the mean picture of LEDs whose light is gathered over the exposure, and over a disc's rows."""
+    even, chords = np.sqrt(0.6) * np.array([-1, 0, 1]), np.sqrt(0.5) * np.array([-1, 0, 1])
+    of_even, of_chords = np.array([5, 8, 5]) / 18, np.array([1, 2, 1]) / 4
+    radius_ns = np.sqrt(area_px2 / np.pi) * camera.sensor_mode.line_time_ns
+    uv = np.zeros((*t_ns.shape, 2))
+    for a, weight_a in zip(even, of_even, strict=True):
+        for b, weight_b in zip(chords, of_chords, strict=True):
+            at_ns = t_ns + np.rint(a * _EXPOSURE_NS / 2 + b * radius_ns).astype(np.int64)
+            R, t_mm = world.pose(at_ns.ravel())
+            pose = R.reshape(*t_ns.shape, 3, 3), t_mm.reshape(*t_ns.shape, 3)
+            prediction, _ = predict_brick(*pose, camera, brick, collar_mm=_COLLAR_MM)
+            uv += weight_a * weight_b * prediction.uv_px
+    return uv
+
+
+def _standing_px(
+    prediction: LedPrediction, camera: PinholeCamera, sd_px: float, rng: np.random.Generator
+) -> FloatArray:
+    """Return errors that stand still: of the profile, of the picture's size, and of each LED, which see."""
+    shift, n_leds = prediction.model_shift_px, prediction.uv_px.shape[1]
+    from_centre = prediction.uv_px - 0.5 * np.array([camera.sensor_mode.width, camera.sensor_mode.height])
+    profile = rng.normal() + _OWN_SHARE * rng.normal(size=(n_leds, 1))
+    return profile * shift + _SIZE_SD * rng.normal() * from_centre + rng.normal(0, sd_px, (n_leds, 2))
 
 
 def _sample(

@@ -5,7 +5,7 @@ more. So what poses have settled (`noise_choice`) is settled once more: the nois
 residuals, and what of the inertial samples is error from how likely the LEDs are.
 """
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ _CHI_2_MEDIAN = 1.386  # median of chi-square with 2 degrees of freedom
 _STEP = 2.0
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from what is stated must earn
 _MOST_STEPS = 5
+_MIN_IMPACTS = 4  # fewer count as many
 
 
 def still_sightings(leds: SeenLeds) -> BoolArray:
@@ -65,6 +66,8 @@ class InertialNoise:
     Attributes
     ----------
     gyro_rough, acc_rough, gyro_systematic, acc_systematic, impact : int
+    n_impacts : int
+        From so few pulses the share of impacts was chosen; 0: it was not.
     """
 
     gyro_rough: int = 0
@@ -72,11 +75,12 @@ class InertialNoise:
     gyro_systematic: int = 0
     acc_systematic: int = 0
     impact: int = 0
+    n_impacts: int = 0
 
     @property
     def n_steps(self) -> int:
         """Return how far from what is stated."""
-        return sum(abs(n) for n in astuple(self))
+        return sum(abs(getattr(self, kind)) for kind in _KINDS)
 
     def levels(self, stated: tuple[NoiseLevel, NoiseLevel]) -> tuple[NoiseLevel, NoiseLevel]:
         """Return the levels of gyro and accelerometer."""
@@ -91,6 +95,10 @@ class InertialNoise:
     def settings(self, stated: FusionSettings) -> FusionSettings:
         """Return settings with the share of impacts."""
         share = _STEP**self.impact
+        if self.n_impacts:
+            # Student's t: what a few pulses were off by tells their spread no better.
+            n = max(self.n_impacts, _MIN_IMPACTS)
+            share = share * float(np.sqrt(n / (n - 2)))
         return replace(
             stated, gyro_impact_share=stated.gyro_impact_share * share,
             acc_impact_share=stated.acc_impact_share * share,
@@ -131,7 +139,9 @@ def choose_inertial_noise(
                 chosen, best = tried, reached
             if chosen is not start:
                 break
-    return chosen
+    pulse = run.signal.acc_impact_mps2 > settings.impact_mps2
+    n_impacts = int(np.count_nonzero(pulse[1:] & ~pulse[:-1]))
+    return replace(chosen, n_impacts=n_impacts if chosen.impact else 0)
 
 
 def _log_likelihood(problem: Problem, gyro_var: FloatArray, acc_var: FloatArray) -> float:

@@ -1,0 +1,67 @@
+"""How far centroids and samples are believed LED by LED: hand-made sightings and residuals."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from bricktrack_host.fusion.fusion_problem import NoiseLevel
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.led_measurements import SeenLeds
+from bricktrack_host.fusion.led_noise import (
+    STATED_SCALES,
+    InertialNoise,
+    centroid_scales,
+    still_sightings,
+)
+
+
+def sightings(frame, led, u_px):
+    m = len(frame)
+    values = {
+        "frame": np.array(frame), "led": np.array(led), "t_ns": np.arange(m), "spread_ns": np.zeros(m),
+        "uv_px": np.stack([np.array(u_px, dtype=float), np.full(m, 500.0)], axis=1),
+        "cov_px2": np.tile(1e-3 * np.eye(2), (m, 1, 1)),
+    }  # fmt: skip
+    return SeenLeds(**{f.name: values[f.name] for f in fields(SeenLeds)})
+
+
+def test_a_picture_stands_still_where_it_was_a_frame_before():
+    #                 first   stays  another LED  moves  a frame is missing
+    leds = sightings([4, 5, 5, 6, 8], [1, 1, 2, 1, 1], [700.0, 700.2, 700.2, 702.0, 702.0])
+    assert still_sightings(leds).tolist() == [False, True, False, False, False]
+
+
+def chi2_of(scale, n, rng):
+    return scale**2 * rng.chisquare(2, n)
+
+
+def test_moving_and_still_pictures_have_scales_of_their_own():
+    rng = np.random.default_rng(1)
+    chi2 = np.concatenate([chi2_of(1.5, 4000, rng), chi2_of(0.3, 4000, rng)])
+    still = np.repeat([False, True], 4000)
+    scales = centroid_scales(chi2, still, np.ones(8000, dtype=bool), STATED_SCALES)
+    # The median of 4000 such is known to 2 %, its root to 1 %.
+    assert scales == pytest.approx([1.5, 0.3], rel=0.04)
+
+
+def test_a_run_at_rest_says_nothing_of_pictures_that_move():
+    rng = np.random.default_rng(2)
+    still = np.ones(2000, dtype=bool)
+    still[:5] = False
+    scales = centroid_scales(chi2_of(0.2, 2000, rng), still, np.ones(2000, dtype=bool), STATED_SCALES)
+    assert scales[0] == 1.0
+    assert scales[1] == pytest.approx(0.2, rel=0.05)
+
+
+def test_steps_of_inertial_noise_are_factors_of_two_and_few_impacts_are_believed_less():
+    noise = InertialNoise(gyro_rough=-1, acc_rough=1, acc_systematic=-2, impact=-2, n_impacts=6)
+    gyro, acc = noise.levels((NoiseLevel(1.0, 0.5), NoiseLevel(1.0, 0.5)))
+    assert (gyro, acc) == (NoiseLevel(0.5, 0.5), NoiseLevel(2.0, 0.125))
+    assert noise.n_steps == 6
+    stated = FusionSettings(acc_impact_share=1.0, gyro_impact_share=0.3)
+    told = noise.settings(stated)
+    # Variance of Student's t with six degrees of freedom: 6 / 4.
+    assert told.acc_impact_share == pytest.approx(0.25 * np.sqrt(1.5))
+    assert told.gyro_impact_share == pytest.approx(0.075 * np.sqrt(1.5))
+    assert InertialNoise().settings(stated) == stated
