@@ -55,37 +55,39 @@ class SensorErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Way:
-    """One run's way forwards: frames at nodes ``at``, all nodes' predictions, and how errors change them."""
+    """One run's way forwards: frames at nodes ``at``, and how errors change what is predicted.
+
+    Attitude R, rows of the covariance, and derivatives of the states wanted, ``changed``, are of all nodes.
+    """
 
     at: IntArray
     R: FloatArray
-    P: FloatArray
+    rows: FloatArray
     y: FloatArray
     H: FloatArray
     S: FloatArray
     gain: FloatArray
-    sensitivity: FloatArray
+    changed: FloatArray
     dy: FloatArray
 
 
-def _way(problem: Problem, passed: Filter, b: int) -> _Way:
-    everywhere = np.arange(len(problem.has_frame))
+def _way(problem: Problem, passed: Filter, b: int, *, of: IntArray) -> _Way:
     at = np.flatnonzero(problem.has_frame[:, b])
-    before, P = passed.predicted(everywhere, b)
-    R, x = np.ascontiguousarray(before.R), before.x
-    y, H = residuals_of(problem, State(R[at], x[at]), at, b)
-    HP = H @ P[at]
+    before = passed.predicted(at, b, of=of)
+    R, x = before.R[at], before.x
+    y, H = residuals_of(problem, State(R, x), at, b)
+    HP = H @ before.P
     S = HP @ np.swapaxes(H, 1, 2) + problem.cov_seen[at, b] * passed.inflation[at, b][:, None, None]
     gain = np.ascontiguousarray(np.swapaxes(np.linalg.solve(S, HP), 1, 2))
     # The frame's own part: what it says of the origin depends on the arm to the sensor.
     since_mid = problem.since_mid_s[at, b]
-    ahead = (x[at, TAU] - problem.tau_lin[b]) + since_mid * (x[at, SKEW] - problem.skew_lin[b])
+    ahead = (x[:, TAU] - problem.tau_lin[b]) + since_mid * (x[:, SKEW] - problem.skew_lin[b])
     own = np.zeros((len(at), 6, N_ERRORS))
-    turn = problem.omega_radps[at, b] - x[at, BG]
-    own[:, 3:, _ARM] = R[at] + R[at] @ skew(turn) * ahead[:, None, None]
+    turn = problem.omega_radps[at, b] - x[:, BG]
+    own[:, 3:, _ARM] = R + R @ skew(turn) * ahead[:, None, None]
     H = np.ascontiguousarray(H)
-    sensitivity, dy = carry_forward(passed.runs[b], at, R, H, gain, own)
-    return _Way(at, R, P, y, H, S, gain, sensitivity, dy)
+    changed, dy = carry_forward(passed.runs[b], at, before.R, H, gain, own, of)
+    return _Way(at, before.R, before.rows, y, H, S, gain, changed, dy)
 
 
 def estimate_sensor_errors(
@@ -104,7 +106,7 @@ def estimate_sensor_errors(
     believed = prior_sd > 0
     if not believed.any() or not problem.has_frame[:, b].any():
         return None
-    way = _way(problem, passed, b)
+    way = _way(problem, passed, b, of=np.zeros(0, dtype=np.int64))
     dy = way.dy[..., believed]
     weighted = np.linalg.solve(way.S, dy)
     normal = np.einsum("nij,nik->jk", dy, weighted) + np.diag(prior_sd[believed] ** -2)
@@ -126,11 +128,10 @@ def with_sensor_doubt(
     for b, unsure in enumerate(sensor_covariance):
         if not unsure.any():
             continue
-        way = _way(problem, passed, b)
+        way = _way(problem, passed, b, of=estimate.of)
         weighted = np.linalg.solve(way.S, way.dy)
-        rows = np.ascontiguousarray(way.P[:, estimate.of])
-        changed = np.ascontiguousarray(way.sensitivity[:, estimate.of])
-        carry_back(passed.runs[b], way.at, way.R, way.H, way.gain, weighted, rows, changed)
+        changed = way.changed
+        carry_back(passed.runs[b], way.at, way.R, way.H, way.gain, weighted, way.rows, changed)
         # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
         at_arm = np.arange(_ARM.start, _ARM.stop)
         changed[:, np.searchsorted(estimate.of, np.arange(POS.start, POS.stop))[:, None], at_arm] -= way.R

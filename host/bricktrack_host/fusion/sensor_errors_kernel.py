@@ -32,9 +32,9 @@ def drive(run: RunArrays, k: int, R: Any, now: Any) -> None:
 
 @compiled
 def carry_forward(
-    run: RunArrays, at: Any, R: Any, H: Any, gain: Any, own: Any
+    run: RunArrays, at: Any, R: Any, H: Any, gain: Any, own: Any, of: Any
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of predicted states (K, 22, q) and of innovations (n, 6, q) by the errors.
+    """Return the derivatives of predicted states (K, c, q) and of innovations (n, 6, q) by the errors.
 
     Parameters
     ----------
@@ -42,11 +42,13 @@ def carry_forward(
         Nodes with a frame, rising.
     R : ndarray, shape (K, 3, 3)
         The filter's attitudes.
+    of : ndarray of int64, shape (c,)
+        The states that are wanted.
     H, gain, own : ndarray, shape (n, 6, 22), (n, 22, 6), (n, 6, q)
         Of the frames; the last is what an error changes of the innovation by itself.
     """
     n_nodes, q = len(R), own.shape[2]
-    predicted, dy = np.zeros((n_nodes, _N, q)), np.zeros((len(at), 6, q))
+    predicted, dy = np.zeros((n_nodes, len(of), q)), np.zeros((len(at), 6, q))
     now, F = np.zeros((_N, q)), np.zeros((_MOVING, _N))
     frame = 0
     for k in range(n_nodes):
@@ -54,7 +56,8 @@ def carry_forward(
             transition(run, k - 1, R[k - 1], F)
             now[:_MOVING] = F @ now
             drive(run, k - 1, R[k - 1], now)
-        predicted[k] = now
+        for c in range(len(of)):
+            predicted[k, c] = now[of[c]]
         if frame < len(at) and at[frame] == k:
             dy[frame] = own[frame] - H[frame] @ now
             now += gain[frame] @ dy[frame]

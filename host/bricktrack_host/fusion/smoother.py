@@ -18,7 +18,7 @@ from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
 from bricktrack_host.fusion.covariance_kernel import SIZE
 from bricktrack_host.fusion.observation_kernel import LedArrays
 from bricktrack_host.fusion.smoother_backward import backward_pass
-from bricktrack_host.fusion.smoother_kernel import CHUNK, forward_pass, states_before_frames
+from bricktrack_host.fusion.smoother_kernel import CHUNK, forward_pass, predict
 from bricktrack_host.fusion.transition_kernel import RunArrays
 
 T = TypeVar("T", bound=np.generic)
@@ -138,6 +138,24 @@ class Estimate:
     led_cov_px2: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Predicted:
+    """What the filter predicts of one run, before it takes in what was seen.
+
+    Attributes
+    ----------
+    R, rows : ndarray, shape (K, 3, 3), (K, c, 22)
+        Attitude at all nodes, and some rows of the covariance: the whole of it would be 4 kB a node.
+    x, P : ndarray, shape (n, 22), (n, 22, 22)
+        At the nodes asked for.
+    """
+
+    R: FloatArray
+    rows: FloatArray
+    x: FloatArray
+    P: FloatArray
+
+
 def _matvec(A: FloatArray, v: FloatArray) -> FloatArray:
     return np.asarray((A @ v[..., None])[..., 0])
 
@@ -248,18 +266,23 @@ class Filter:
         nis = self.nis[:, b] if leds is None else leds.nis[leds.use]
         return float(np.nanmean(nis)) if np.isfinite(nis).any() else float("nan")
 
-    def predicted(self, at: IntArray, b: int) -> tuple[State, FloatArray]:
-        """Return states and covariances of one run at rising nodes, before what was seen there."""
-        R, x, P = (
-            np.empty((len(at), 3, 3)),
-            np.empty((len(at), N_STATES)),
-            np.empty((len(at), N_STATES, N_STATES)),
+    def predicted(self, at: IntArray, b: int, *, of: IntArray) -> "Predicted":
+        """Return what the filter predicts of one run, before what was seen; the whole at rising nodes ``at``.
+
+        ``of``: the states of whose covariance the rows are wanted at all nodes.
+        """
+        n_nodes = len(self.nis)
+        predicted = Predicted(
+            R=np.empty((n_nodes, 3, 3)),
+            rows=np.empty((n_nodes, len(of), N_STATES)),
+            x=np.empty((len(at), N_STATES)),
+            P=np.empty((len(at), N_STATES, N_STATES)),
         )
-        states_before_frames(
+        predict(
             self.runs[b], *self._noise_of(b), *_start_of(self._problem, b), np.asarray(at, dtype=np.int64),
-            R, x, P,
+            np.asarray(of, dtype=np.int64), predicted.R, predicted.rows, predicted.x, predicted.P,
         )  # fmt: skip
-        return State(R, x), P
+        return predicted
 
     def forward(self, of: IntArray = SEEN) -> Estimate:
         """Return the filtered states: each knows only the past."""
