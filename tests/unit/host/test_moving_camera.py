@@ -11,7 +11,9 @@ from two_imus import IMU_TO_CAMERA_MM, simulate_two_imus
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.fusion.attitude import mean_rate
 from bricktrack_host.fusion.estimate import fuse
-from bricktrack_host.fusion.moving_camera import CameraImu
+from bricktrack_host.fusion.imu_signal import ImuSignal
+from bricktrack_host.fusion.moving_camera import CameraImu, closing_bias
+from bricktrack_host.tracks import ImuTrack
 
 DROPOUTS = ((2.0, 2.4), (3.6, 3.9))
 
@@ -102,3 +104,28 @@ def test_a_bias_is_the_mean_rate_of_a_body_that_ends_as_it_began():
     run = simulate_two_imus(1, rocking_deg=1.0, duration_s=4.0)
     rest = simulate_two_imus(1, acc_g=0.0, rocking_deg=0.0, duration_s=4.0)
     assert np.allclose(mean_rate(run.camera), mean_rate(rest.camera), atol=1.5e-3)
+
+
+def test_a_body_that_rocks_about_two_axes_turns_on_the_mean_but_has_no_bias():
+    # Rocking by 3 degrees at 5 Hz, a quarter period apart: on the mean it turns about the third axis by half the
+    # amplitudes' product times the rate (coning), 0.5 * 0.052**2 * 31.4 = 0.043 rad/s.
+    t = np.arange(0, 6.0, 1e-3)
+    rest = np.clip(t - 1, 0, 1) * np.clip(5 - t, 0, 1)
+    angles = (
+        np.radians(3)
+        * rest[:, None]
+        * np.stack([np.sin(10 * np.pi * t), np.cos(10 * np.pi * t), 0 * t], axis=1)
+    )
+    body = Rotation.from_rotvec(angles)
+    between = (body[:-1].inv() * body[1:]).as_rotvec() / 1e-3
+    bias = np.array([0.01, -0.02, 0.005])
+    middle = t[:-1] + 5e-4
+    at = np.arange(0.05, 5.95, 0.01)
+    gyro = np.stack([np.interp(at, middle, column) for column in between.T], axis=1) + bias
+    track = ImuTrack(
+        t_ns=np.round(at * 1e9).astype(np.int64), acc_mps2=np.zeros((len(at), 3)), gyro_radps=gyro,
+        flags=np.zeros(len(at), dtype=np.int64), acc_range_mps2=0.0,
+    )  # fmt: skip
+    mean = mean_rate(track)
+    assert abs(mean[2] - bias[2]) > 0.01
+    assert closing_bias(ImuSignal.from_track(track), mean) == pytest.approx(bias, abs=5e-4)
