@@ -38,28 +38,34 @@ def steady_poses(run: RunIdentities, usual_px: FloatArray) -> tuple[FloatArray, 
         np.full_like(run.found.R_camera_brick, np.nan),
         np.full_like(run.found.t_camera_brick_mm, np.nan),
     )
-    known = run.known_frames()
-    for part in np.split(known, np.flatnonzero(np.diff(known) > _MAX_LOST + 1) + 1):
-        if part.size < _LEAST_FRAMES:
-            R[part], t_mm[part] = run.found.R_camera_brick[part], run.found.t_camera_brick_mm[part]
-            continue
-        frames = np.arange(part[0], part[-1] + 1)
-        R[frames], t_mm[frames] = _bridged(run, part, frames)
+    parts = []
+    for known in _parts(run):
+        frames = np.arange(known[0], known[-1] + 1) if known.size >= _LEAST_FRAMES else known
+        R[frames], t_mm[frames] = _bridged(run, known, frames)
+        parts += [frames] if known.size >= _LEAST_FRAMES else []
+    lights = run.lights_of(np.arange(len(R)))
     for motion_is_known in (False, True):
-        frames = np.flatnonzero(all_finite(R, 2))
-        lights = run.lights_of(np.arange(len(R)))
         if motion_is_known:
             within = run_motion(
                 run.stamps_ns, lights.uv_px, R, t_mm, run.ray_model, run.brick_model, collar_mm=run.collar_mm
             ).within
         else:
             within = unknown_motion(lights.uv_px, run.ray_model)
-        for part in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):
-            if part.size >= _LEAST_FRAMES:
-                R[part], t_mm[part] = _smoothed(
-                    run, part, R[part], t_mm[part], motion_of(within, part), usual_px
-                )
+        for frames in parts:
+            R[frames], t_mm[frames] = _smoothed(
+                run, frames, R[frames], t_mm[frames], motion_of(within, frames), usual_px
+            )
     return R, t_mm
+
+
+def _parts(run: RunIdentities) -> list[IntArray]:
+    """Return the known frames, parted where too many are lost, or time has passed that no frame tells of."""
+    known = run.known_frames()
+    if known.size < 2:
+        return [known] if known.size else []
+    steps = np.diff(known)
+    periods = np.rint(np.diff(run.stamps_ns[known]) / np.median(np.diff(run.stamps_ns)))
+    return np.split(known, np.flatnonzero((steps > _MAX_LOST + 1) | (periods != steps)) + 1)
 
 
 def _bridged(run: RunIdentities, known: IntArray, frames: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -130,3 +130,11 @@ def test_frames_lost_for_a_moment_are_bridged_and_for_longer_are_not():
     )
     run.refuse(np.arange(9, 14))
     assert np.isnan(steady_poses(run, USUAL)[0][9:14]).all()
+
+
+def test_frames_are_not_bridged_over_time_that_no_frame_tells_of():
+    run, _, _ = known_run()
+    run.refuse(np.array([9, 10]))
+    assert np.isfinite(steady_poses(run, USUAL)[0][9:11]).all()
+    run.stamps_ns[10:] += 5 * STEP_NS  # the camera left five frames out
+    assert np.isnan(steady_poses(run, USUAL)[0][9:11]).all()
