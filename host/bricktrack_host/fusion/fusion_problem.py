@@ -1,6 +1,6 @@
 """From tracks to the smoother's problem: nodes in time, noise of each step, start values and their sd."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -8,6 +8,10 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_samples import CleanSamples, clean_samples, seconds_since
 from bricktrack_host.fusion.imu_signal import ImuSignal
+from bricktrack_host.fusion.inertial_noise import NoiseLevel as NoiseLevel
+from bricktrack_host.fusion.inertial_noise import NoiseParts as NoiseParts
+from bricktrack_host.fusion.inertial_noise import camera_noise, noise_parts
+from bricktrack_host.fusion.linearisation import Linearisation as Linearisation
 from bricktrack_host.fusion.moving_camera import CameraMotion, imu_seconds, still_track
 from bricktrack_host.fusion.sensor_errors import SensorErrors
 from bricktrack_host.fusion.smoother import (
@@ -29,25 +33,7 @@ from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, TimeAlign
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _MIN_POSITION_SD_M = 2e-6  # a covariance below this is not believed
-_ONE_MISSING = 2.5  # periods between samples above which more than one is missing
 _LONGEST_STEP_PERIODS = 1.25
-_NOISE_POINTS = 4  # of a step, over which its noise is averaged
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Linearisation:
-    """Where nodes are placed and increments taken."""
-
-    tau_s: float
-    skew: float
-    lag_s: float
-    loss_s2: float
-    bg_radps: FloatArray
-    ba_mps2: FloatArray
-    R_first: FloatArray
-    v_first_mps: FloatArray
-    p_first_m: FloatArray
-    gravity_mps2: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,102 +200,6 @@ def place_nodes(run: Run, lin: Linearisation) -> Nodes:
     share = (np.arange(first[-1]) - first[interval]) / n_steps[interval]
     t_s = np.append(ends[interval] + share * np.diff(ends)[interval], ends[-1])
     return Nodes(t_s, first[1:-1])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NoiseParts:
-    """Spectral densities of inertial errors at instants, by cause; shape (n,), rad^2/s and m^2/s^3.
-
-    Attributes
-    ----------
-    gyro_fixed, acc_fixed
-        White noise of the samples, impacts, clipping, a sample bridged, and gaps, where the whole spread of
-        the signal is the error.
-    gyro_rough, acc_rough
-        Steady roughness beyond the sensor's own noise, at a share of 1.
-    gyro_systematic, acc_systematic
-        Scale and lever-arm errors in proportion to the motion, which keep their sign for a while.
-    """
-
-    gyro_fixed: FloatArray
-    gyro_rough: FloatArray
-    gyro_systematic: FloatArray
-    acc_fixed: FloatArray
-    acc_rough: FloatArray
-    acc_systematic: FloatArray
-
-    def __add__(self, other: "NoiseParts") -> "NoiseParts":
-        """Return the densities of two sensors together."""
-        return NoiseParts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
-
-    def gyro(self, level: "NoiseLevel") -> FloatArray:
-        """Return the whole density for one level."""
-        return np.asarray(
-            self.gyro_fixed
-            + level.roughness**2 * self.gyro_rough
-            + level.systematic**2 * self.gyro_systematic
-        )
-
-    def acc(self, level: "NoiseLevel") -> FloatArray:
-        """Return the whole density for one level."""
-        return np.asarray(
-            self.acc_fixed + level.roughness**2 * self.acc_rough + level.systematic**2 * self.acc_systematic
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class NoiseLevel:
-    """How much of the roughness, and how many times the stated systematic error, is believed to be error."""
-
-    roughness: float
-    systematic: float
-
-
-def noise_parts(
-    signal: ImuSignal, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
-) -> NoiseParts:
-    """Return how far the inertial signal is to be trusted over the steps between instants of IMU time."""
-    s, period, hold = settings, signal.period_s, settings.systematic_time_s
-    gyro = signal.gyro_radps - lin.bg_radps
-    turn = np.linalg.norm(np.gradient(gyro, signal.t_s, axis=0), axis=1)
-    size = np.linalg.norm(gyro, axis=1)
-    # What of the force is not constant in the body: the constant part is the bias state's.
-    moving = np.linalg.norm(signal.acc_mps2 - np.median(signal.acc_mps2, axis=0), axis=1)
-    arm_m = s.lever_arm_sd_mm * 1e-3
-
-    points = t_s[:-1] + np.diff(t_s, axis=0) * ((np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS)[:, None]
-
-    def at(values: FloatArray, shift_s: float) -> FloatArray:
-        return np.asarray(np.interp(points + shift_s, signal.t_s, values).mean(axis=0))
-
-    gap = hold * signal.in_gap(points, least_periods=_ONE_MISSING).mean(axis=0)
-    bridged = period * signal.in_gap(points).mean(axis=0)
-    gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
-    shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
-    acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2
-    gyro_rough = np.maximum(signal.gyro_roughness_radps**2 - s.gyro_noise_radps**2, 0.0)
-    acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
-    acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2
-    return NoiseParts(
-        gyro_fixed=at(gyro_fixed * period, 0.0)
-        + bridged * at(signal.gyro_bridge_radps, 0.0) ** 2
-        + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2,
-        gyro_rough=at(gyro_rough * period, 0.0),
-        gyro_systematic=at((s.gyro_scale_sd * size) ** 2 * hold, 0.0),
-        acc_fixed=at(acc_fixed * period, lin.lag_s)
-        + bridged * at(signal.acc_bridge_mps2, lin.lag_s) ** 2
-        + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2,
-        acc_rough=at(acc_rough * period, lin.lag_s),
-        acc_systematic=at(acc_systematic * hold, lin.lag_s),
-    )
-
-
-def camera_noise(
-    camera: CameraMotion, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
-) -> NoiseParts:
-    """Return the noise that the camera's own sensor adds over the steps between instants of IMU time."""
-    own = replace(lin, bg_radps=camera.bias_radps, lag_s=camera.acc_lag_s(lin.lag_s))
-    return noise_parts(camera.signal, camera.own_s(t_s), own, settings)
 
 
 def start_covariance(run: Run, lin: Linearisation, settings: FusionSettings) -> FloatArray:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, NoiseLevel, Run, noise_parts
+from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, NoiseLevel, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial_noise import noise_parts
 from bricktrack_host.fusion.led_measurements import SeenLeds
 from bricktrack_host.fusion.smoother import Problem, score_noise
 from bricktrack_host.fusion.smoother_kernel import NIS_CAP
