@@ -65,6 +65,15 @@ def compiled_sums(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return _kept(function, _nrt=False, fastmath={"contract"})
 
 
+def compiled_inline(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Return a function compiled as by `compiled_in_place`, whose code is put where it is called.
+
+    An array is passed as a dozen numbers: for a short function with several arrays that costs more than what
+    it does.
+    """
+    return _kept(function, _nrt=False, forceinline=True)
+
+
 def _kept(function: Callable[_P, _R], **options: bool | set[str]) -> Callable[_P, _R]:
     folder = _folder(function.__code__.co_filename)
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]

@@ -8,7 +8,7 @@ outline's moments, the lens's curvature across the LED) is had once, as the LED'
 import math
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.compiled import compiled_in_place
+from bricktrack_host.compiled import compiled_in_place, compiled_inline
 
 (
     TANGENT,
@@ -67,7 +67,7 @@ def outline(c: float, r: float, h: float, distance: float) -> tuple[float, float
     return 2 * half_area, half_moment / half_area, 0.5 * (rho - rear)
 
 
-@compiled_in_place
+@compiled_inline
 def pixel_near(
     x: float, y: float, b: float, hits: FloatArray, i: int, k: int
 ) -> tuple[float, float, float, float, float, float, float, float]:
@@ -189,7 +189,7 @@ def led_shape(
     shape[k, LENS_V] = var_1 * (0.5 * aa1 + grow_1 * a1) + var_2 * (0.5 * bb1 + grow_2 * b1)
 
 
-@compiled_in_place
+@compiled_inline
 def _bend(
     a0: float,
     a1: float,
@@ -223,7 +223,7 @@ def _bend(
     return -(i00 * x + i01 * y), -(i10 * x + i11 * y)
 
 
-@compiled_in_place
+@compiled_inline
 def led_view(
     centre: FloatArray,
     axis: FloatArray,

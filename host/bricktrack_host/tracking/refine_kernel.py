@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.compiled import compiled_in_place
+from bricktrack_host.compiled import compiled_in_place, compiled_inline
 from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view
 from bricktrack_host.tracking.small_algebra import inverse_block, quadratic, rotation, solve
 
@@ -209,7 +209,7 @@ def _take_shapes(
             led_shape(centre, axis, radii[k], model.collar, hits, i, k, model.plane_a, model.apart, shapes)
 
 
-@compiled_in_place
+@compiled_inline
 def _place(
     i: int,
     k: int,
@@ -342,7 +342,7 @@ def _normal_equations(
     return cost + _prior_cost(i, observed, model, more)
 
 
-@compiled_in_place
+@compiled_inline
 def _huber(sigmas: float, limit: float) -> float:
     return sigmas * sigmas if sigmas <= limit else limit * (2 * sigmas - limit)
 
@@ -378,7 +378,7 @@ def _follow_residuals(
     return cost + _prior_cost(i, observed, model, more)
 
 
-@compiled_in_place
+@compiled_inline
 def _pose_row(
     row: int,
     k: int,
