@@ -8,9 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.tracking import led_tracker
 from bricktrack_host.tracking.led_tracker import observe_leds
 from bricktrack_host.tracking.optical_track import solve_poses
 from bricktrack_host.tracking.run_lights import usual_radius_px
+from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()
 COLLAR = 0.7
@@ -155,3 +157,23 @@ def test_a_run_without_pictures_is_all_lost(caplog):
 def test_the_usual_radius_is_the_pinholes():
     # 3 mm midway between the planes, 131.1 mm: 1560 * 3 / 131.1 px.
     assert usual_radius_px(CAMERA, BRICK) == pytest.approx(1560 * 3 / 131.114, rel=0.01)
+
+
+def test_a_smear_widens_a_centroid_along_it_and_some_across():
+    n = 4
+    uv = np.zeros((n, 1, 2))
+    uv[:, 0, 0] = 200.0 * np.arange(n)
+    seen = LedObservations(
+        sensor_timestamp_ns=np.arange(n, dtype=np.int64) * 40_000_000,
+        exposure_ns=np.full(n, 8_000_000),
+        uv_px=uv,
+        cov_px2=np.zeros((n, 1, 2, 2)),
+        area_px2=np.full((n, 1), 100.0),
+        led_flags=np.zeros((n, 1), dtype=np.int64),
+        frame_flags=np.zeros(n, dtype=np.int64),
+    )
+    led_tracker._widen_blurred(seen)
+    # 200 px in 40 ms are 40 px in 8 ms: 3 % of it along, half a per cent each way.
+    expected = np.diag([(0.03 * 40) ** 2 + (0.005 * 40) ** 2, (0.005 * 40) ** 2])
+    np.testing.assert_allclose(seen.cov_px2[:, 0], np.broadcast_to(expected, (n, 2, 2)), atol=1e-12)
+    assert (seen.led_flags == LedFlag.BLURRED).all()
