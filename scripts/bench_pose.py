@@ -48,6 +48,7 @@ def main() -> int:
     args = parser.parse_args()
     brick = paper_brick()
     camera = TrueCamera.of_seed(args.seed)
+    clean_rays = camera.calibrated(noise_px=1e-4, rng=np.random.default_rng([args.seed, 6]))
     print(f"All figures simulated. Lens and noise of seed {args.seed}; {args.frames} random poses.\n")
     print(
         "RMSE over the bound                     rot x  rot y  rot z      x      y      z   failed   NEES/6"
@@ -55,7 +56,7 @@ def main() -> int:
     for noise in NOISES_PX:
         rng = np.random.default_rng([args.seed, round(1000 * noise)])
         rays = camera.calibrated(noise_px=noise, rng=rng)
-        ours, raw = Tally(), Tally()
+        ours, clean, raw = Tally(), Tally(), Tally()
         left = args.frames
         while left > 0:
             n = min(CHUNK, left)
@@ -67,7 +68,12 @@ def main() -> int:
                 scene.uv, scene.cov, R, t, rays, scene.points, collar_mm=0.0, profile_is_exact=True
             )
             ours.add(scene, fitted.R_camera_brick, fitted.t_camera_brick_mm, fitted.covariance)
+            fitted = refine_poses(
+                scene.uv, scene.cov, R, t, clean_rays, scene.points, collar_mm=0.0, profile_is_exact=True
+            )
+            clean.add(scene, fitted.R_camera_brick, fitted.t_camera_brick_mm, fitted.covariance)
         print(f"{noise:4.2f} px  PRSOI and refinement, dots   {ours}")
+        print(f"         the same, dots without noise {clean}")
         print(f"         PRSOI alone, dots            {raw}")
         few = Scene.random(OTHERS, brick, camera, noise, rng)
         for name, solve in other_solvers().items():
@@ -341,6 +347,26 @@ def timed(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
             run()
             best = min(best, time.process_time() - start)
         print(f"{name:24s} {best / len(scene.R) * 1e6:7.2f} us a frame")
+    print("\nRefinement with rays, shared by threads: wall time, best of three")
+    for n_threads in (1, 2):
+        best = np.inf
+        for _ in range(3):
+            start = time.perf_counter()
+            refine_poses(
+                scene.uv,
+                scene.cov,
+                R,
+                t,
+                rays,
+                scene.points,
+                collar_mm=0.0,
+                profile_is_exact=True,
+                n_threads=n_threads,
+            )
+            best = min(best, time.perf_counter() - start)
+        print(
+            f"{n_threads} thread{'s' if n_threads > 1 else ' '}                {best / len(scene.R) * 1e6:7.2f} us a frame"
+        )
 
 
 if __name__ == "__main__":
