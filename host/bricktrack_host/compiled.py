@@ -11,11 +11,13 @@ import hashlib
 import logging
 import os
 import re
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, cast
+from threading import Lock
+from typing import Any, ParamSpec, TextIO, TypeVar, cast
 
 import numba
 from numba import njit
@@ -31,7 +33,12 @@ except ImportError:  # not on Windows, where each process compiles for itself
 logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_ROOT = Path(os.environ.get("NUMBA_CACHE_DIR") or Path.home() / ".cache" / "bricktrack" / "compiled")
+COMPILED_ROOT = Path(os.environ.get("NUMBA_CACHE_DIR") or Path.home() / ".cache" / "bricktrack" / "compiled")
+_NAMING = Lock()
+"""Numba takes a function's folder from a setting of the whole process; modules may be imported by threads."""
+PATIENCE_S = 600.0
+"""Another process that compiles for longer has been stopped: its code is compiled here too."""
+_POLL_S = 0.1
 _OURS = {
     "bricktrack_host": Path(__file__).parent,
     "bricktrack_common": Path(bricktrack_common.__file__).parent,
@@ -76,9 +83,10 @@ def compiled_inline(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 def _kept(function: Callable[_P, _R], **options: bool | set[str]) -> Callable[_P, _R]:
     folder = _folder(function.__code__.co_filename)
-    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
     made: Any = njit(cache=True, nogil=True, error_model="numpy", **options)  # type: ignore[call-overload]
-    dispatcher = made(function)
+    with _NAMING:
+        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+        dispatcher = made(function)
     dispatcher.compile = _one_at_a_time(dispatcher.compile, folder, function.__qualname__)
     return cast(Callable[_P, _R], dispatcher)
 
@@ -104,7 +112,7 @@ def _one_at_a_time(compile_for: Callable[[Any], Any], folder: Path, name: str) -
 def _say_once() -> None:
     logger.warning(
         "compiling the numerical loops for this machine, about a minute in all; kept in %s, so only once",
-        _ROOT,
+        COMPILED_ROOT,
     )
 
 
@@ -119,16 +127,31 @@ def _lock_between_processes(path: Path) -> Iterator[None]:
         return
     with file:
         if fcntl is not None:
-            with suppress(OSError):  # some network file systems have no locks
-                fcntl.flock(file, fcntl.LOCK_EX)  # given back when the file is closed
+            _wait_for(file, path)
         yield
 
 
+def _wait_for(file: TextIO, path: Path) -> None:
+    """Take the lock of a file, which its closing gives back, or go on without after `PATIENCE_S`."""
+    until_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until_s:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(_POLL_S)
+        except OSError:  # some network file systems have no locks
+            return
+        else:
+            return
+    logger.warning("%s: another process holds it for %.0f s; compiling without", path, PATIENCE_S)
+
+
+@cache
 def _folder(filename: str) -> Path:
     held = hashlib.sha256()
     for source in sorted(sources_behind(Path(filename))):
         held.update(source.name.encode() + _read(source))
-    return _ROOT / held.hexdigest()[:16]
+    return COMPILED_ROOT / held.hexdigest()[:16]
 
 
 def sources_behind(source: Path) -> set[Path]:

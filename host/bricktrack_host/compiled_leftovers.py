@@ -5,7 +5,7 @@ import shutil
 import time
 from pathlib import Path
 
-from bricktrack_host.compiled import _ROOT as COMPILED_ROOT
+from bricktrack_host.compiled import COMPILED_ROOT
 
 UNUSED_S = 90 * 86_400
 _FOLDER = re.compile(r"[0-9a-f]{16}")  # as `compiled` names them; anything else is somebody else's

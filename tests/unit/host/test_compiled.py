@@ -1,3 +1,4 @@
+import fcntl
 import os
 import subprocess
 import sys
@@ -78,3 +79,17 @@ def test_of_two_processes_one_compiles_and_the_other_loads(tmp_path):
     assert sorted(int(out) for out, _ in told) == [0, 1]
     # Whoever compiles says so; the other may have begun before anything was kept.
     assert any("only once" in err for _, err in told)
+
+
+def test_a_lock_that_is_never_given_back_holds_nobody_up(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(module, "PATIENCE_S", 0.3)
+    path = tmp_path / "total.lock"
+    with path.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with module._lock_between_processes(path):
+            pass
+    assert "total.lock: another process holds it" in caplog.text
+    caplog.clear()
+    with module._lock_between_processes(path):
+        pass
+    assert not caplog.records
