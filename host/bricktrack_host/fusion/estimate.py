@@ -316,7 +316,8 @@ def fused_result(
 
     if track is None:
         track = sample(s.estimate, is_smoothed=True)
-        contested = rejected & (chi2 < settings.contest_chi2)
+        # A frame that is used and yet not followed contradicts the rest as much as one left out.
+        contested = np.isfinite(chi2) & (rejected != (chi2 >= settings.contest_chi2))
         if contested.any():
             frames = item.optical
             track = with_contested_frames(

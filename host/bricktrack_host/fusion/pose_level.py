@@ -4,6 +4,7 @@ The order is DESIGN 8.2's: a first pass settles noise and outliers, a second is 
 """
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -39,6 +40,10 @@ from bricktrack_host.fusion.smoother import (
 
 _FIRST_FRAMES = 15
 _FIRST_WITHIN_RAD = 0.3
+_FIRST_WITHIN_SD = 10.0  # of a frame's position; what is left out here may come back
+_FIRST_WITHIN_MEDIANS = 6.0
+_MIN_VOTERS = 7  # three give the parabola, and most of the others must agree with it
+_LAST_PASSES = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,12 +83,8 @@ def smooth_poses(runs: list[Run], settings: FusionSettings) -> list[Smoothed]:
     """Return the smoothed states of a batch of runs."""
     lins = [first_linearisation(run, settings) for run in runs]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
-    starts = [_attitude_at_first_node(*three) for three in zip(runs, nodes, lins, strict=True)]
-    lins = [
-        replace(lin, R_first=R, p_first_m=run.p_seen_m[first] + run.R_seen[first] @ run.lever_arm_m)
-        for run, lin, (R, agrees) in zip(runs, lins, starts, strict=True)
-        for first in [int(np.argmax(agrees))]
-    ]
+    starts = [_agreeing_start(*three) for three in zip(runs, nodes, lins, strict=True)]
+    lins = [lin for lin, _ in starts]
     used = [agrees for _, agrees in starts]
     first = settle_noise(runs, lins, nodes, used, settings)
     scales, levels = first.scales, first.levels
@@ -94,21 +95,17 @@ def smooth_poses(runs: list[Run], settings: FusionSettings) -> list[Smoothed]:
     lins = [relinearised(runs[b], first.estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
     runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(first.runs, lins, strict=True)]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
-    for is_last in (False, True):
+    for is_last in [False] * (_LAST_PASSES - 1) + [True]:
         problem, _ = build_problem(
             runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
         )
         passed = Filter(problem)
         estimate = passed.smooth()
         chi2 = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
-        # The first pass knew little of the sensors and may have been wrong about a frame at an impact.
-        back = [
-            ~u & (c * min(float(scale.min()), 1.0) ** 2 < settings.gate_chi2)
-            for u, c, scale in zip(used, chi2, scales, strict=True)
-        ]
-        if is_last or not any(b.any() for b in back):
+        judged = [_judged(*three, settings) for three in zip(used, chi2, scales, strict=True)]
+        if is_last or all(np.array_equal(u, j) for u, j in zip(used, judged, strict=True)):
             break
-        used = [u | b for u, b in zip(used, back, strict=True)]
+        used = judged
     estimate = with_sensor_doubt(problem, passed, estimate, [run.sensor_covariance for run in runs])
     return [
         Smoothed(run, node, lin, problem, passed, estimate, b, used[b], scales[b], levels[b], chi2[b])
@@ -116,28 +113,77 @@ def smooth_poses(runs: list[Run], settings: FusionSettings) -> list[Smoothed]:
     ]
 
 
-def _attitude_at_first_node(run: Run, nodes: Nodes, lin: Linearisation) -> tuple[FloatArray, BoolArray]:
-    """Return the attitude at the first node that most of the early frames agree on, and which frames do.
+def _judged(used: BoolArray, chi2: FloatArray, scale: FloatArray, settings: FusionSettings) -> BoolArray:
+    """Return which frames to use after a pass, by how far each lies from all the others.
 
-    The frames are carried back by the gyro. The filter's start is wide and would follow a false first pose
-    anywhere, so the early frames that disagree are not shown to it.
+    The first pass knew little of the sensors and may have been wrong about a frame at an impact: it comes
+    back. One that no light or lens explains goes, and good ones that it dragged along come back after it.
+    """
+    far = chi2 * min(float(scale.min()), 1.0) ** 2
+    kept = used & (far < settings.contest_chi2)
+    if kept.sum() <= 0.5 * len(used):  # else it is not the frames that are wrong
+        kept = used
+    return np.asarray(kept | (~used & (far < settings.gate_chi2)))
+
+
+def _agreeing_start(run: Run, nodes: Nodes, lin: Linearisation) -> tuple[Linearisation, BoolArray]:
+    """Return the start that most of the early frames agree on, and which frames do.
+
+    The filter's start is wide and would follow false first poses anywhere, so the early frames that disagree
+    are not shown to it. The samples carry the frames to one instant; the later ones are all taken to agree.
     """
     at = nodes.node_of_frame[:_FIRST_FRAMES]
     k = max(int(at[-1]), 1)
+    start_s, end_s = nodes.t_s[:k], nodes.t_s[1 : k + 1]
     step = run.signal.increments(
-        nodes.t_s[:k],
-        nodes.t_s[1 : k + 1],
-        gyro_bias_radps=lin.bg_radps,
-        acc_bias_mps2=lin.ba_mps2,
-        acc_lag_s=lin.lag_s,
+        start_s, end_s, gyro_bias_radps=lin.bg_radps, acc_bias_mps2=lin.ba_mps2, acc_lag_s=lin.lag_s
     )
-    since = np.concatenate([np.eye(3)[None], chain_rotations(step.R)])[at]
-    first = run.R_seen[: len(at)] @ np.swapaxes(since, 1, 2)
+    since = np.concatenate([np.eye(3)[None], chain_rotations(step.R)])
+    R_first, turned = _attitude_at_first_node(run.R_seen[: len(at)], since[at])
+    # Where the samples alone take a brick that stood still at the first node.
+    known = np.zeros((k, 2, 3))
+    if run.camera is not None:
+        known = run.camera.increments(start_s, end_s, acc_lag_s=lin.lag_s)[:, :2]
+    dt = (end_s - start_s)[:, None]
+    R = R_first @ since[:-1]
+    dv = np.einsum("nij,nj->ni", R, step.dv_mps) + dt * lin.gravity_mps2 + known[:, 0]
+    dp = np.einsum("nij,nj->ni", R, step.dp_m) + 0.5 * dt**2 * lin.gravity_mps2 + known[:, 1]
+    v = np.concatenate([np.zeros((1, 3)), np.cumsum(dv, axis=0)])
+    felt_m = np.concatenate([np.zeros((1, 3)), np.cumsum(dp + v[:-1] * dt, axis=0)])[at]
+    seen_m = run.p_seen_m[: len(at)] + run.R_seen[: len(at)] @ run.lever_arm_m
+    sd_m = np.sqrt(np.trace(run.cov_seen[: len(at), 3:, 3:], axis1=1, axis2=2))
+    placed = turned.copy()
+    placed[turned] = _on_one_parabola(nodes.t_s[at[turned]], (seen_m - felt_m)[turned], sd_m[turned])
+    agrees = np.ones(len(run.t_cam_s), dtype=np.bool_)
+    agrees[: len(at)] = placed
+    return replace(lin, R_first=R_first, p_first_m=seen_m[int(np.argmax(placed))]), agrees
+
+
+def _attitude_at_first_node(R_seen: FloatArray, since: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the attitude at the first node that most frames agree on, and which do.
+
+    ``since``, shape (n, 3, 3): what the gyro says that the brick has turned by at each frame.
+    """
+    first = R_seen @ np.swapaxes(since, 1, 2)
     cosine = 0.5 * (np.einsum("iab,jab->ij", first, first) - 1)
     best = int(np.argmax(np.median(cosine, axis=1)))
-    agrees = np.ones(len(run.t_cam_s), dtype=np.bool_)
-    agrees[: len(at)] = cosine[best] > np.cos(_FIRST_WITHIN_RAD)
-    return nearest_rotation(first[best]), agrees
+    return nearest_rotation(first[best]), np.asarray(cosine[best] > np.cos(_FIRST_WITHIN_RAD))
+
+
+def _on_one_parabola(t_s: FloatArray, p_m: FloatArray, sd_m: FloatArray) -> BoolArray:
+    """Return which positions lie near the parabola that most of them lie near: least median of distances.
+
+    What the samples leave of a motion is its start, its velocity then, and what the tilt of gravity and the
+    accelerometer's bias add, in proportion to the square of time.
+    """
+    n = len(t_s)
+    if n < _MIN_VOTERS:
+        return np.ones(n, dtype=np.bool_)
+    powers = np.vander((t_s - t_s[0]) / (t_s[-1] - t_s[0]), 3)
+    three = np.array(list(combinations(range(n), 3)))
+    off_m = np.linalg.norm(p_m - powers @ np.linalg.solve(powers[three], p_m[three]), axis=2)
+    best = off_m[int(np.argmin(np.median(off_m, axis=1)))]
+    return np.asarray(best < np.maximum(_FIRST_WITHIN_SD * sd_m, _FIRST_WITHIN_MEDIANS * np.median(best)))
 
 
 def relinearised(
