@@ -15,6 +15,7 @@ from bricktrack_common.imu_records import ImuDescription, ImuSamples, decode_imu
 from bricktrack_common.run_manifest import (
     EDGES_NAME,
     FRAMES_NAME,
+    LOG_NAME,
     MANIFEST_NAME,
     VIDEO_NAME,
     RunManifest,
@@ -83,8 +84,8 @@ def read_edges(path: Path) -> tuple[IntArray, int]:
 def read_run(folder: Path, *, verify_hashes: bool = False) -> Run:
     """Return a run folder's contents.
 
-    A file that the manifest lists and that is not there, a cut stream and a size that differs are put
-    into ``problems`` in words; a stream that is damaged inside raises.
+    A file that the manifest lists and that is not there, or holds nothing, a cut stream and a size that
+    differs are put into ``problems`` in words; a stream that is damaged inside raises.
 
     Parameters
     ----------
@@ -109,8 +110,11 @@ def read_run(folder: Path, *, verify_hashes: bool = False) -> Run:
         if not path.is_file():
             problems.append(f"{entry.name} is missing")
             continue
-        present.add(entry.name)
         size = path.stat().st_size
+        if size == 0 and entry.name != LOG_NAME:  # as a power cut leaves files that were not on the disk yet
+            problems.append(f"{entry.name} is empty and counts as missing")
+            continue
+        present.add(entry.name)
         if size != entry.n_bytes:
             problems.append(f"{entry.name} has {size} bytes; the manifest says {entry.n_bytes}")
         elif verify_hashes and sha256_file(path) != entry.sha256:

@@ -8,6 +8,7 @@ import pytest
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.frame_times import FrameRecord, write_frames
+from bricktrack_common.imu_records import ImuDescription
 from bricktrack_common.run_folder import read_run, write_edges
 from bricktrack_common.run_manifest import (
     CameraSection,
@@ -94,6 +95,31 @@ def test_what_is_missing_is_said_in_words(folder):
     assert problems[2] == "edges.msgpack is missing"
     assert problems[3].startswith("frames.msgpack has ")
     assert problems[4].startswith("frames.msgpack is cut")
+
+
+@pytest.mark.parametrize("manifest_knows", [False, True])
+def test_an_empty_file_counts_as_missing(folder, manifest_knows):
+    (folder.path / "imu_led.msgpack").write_bytes(b"\x80")
+    sensor = ImuDescription(
+        name="led", chip_id="", bus="sim", address=0x28, opr_mode=7, fusion=False, acc_range_g=16.0,
+        period_ns=10_000_000, t0_ns=0,
+    )  # fmt: skip
+    folder.manifest(imus=[sensor])
+    names = ["edges.msgpack", "frames.msgpack", "imu_led.msgpack", "video.h264"]
+    for name in names:
+        (folder.path / name).write_bytes(b"")
+    if manifest_knows:
+        folder.manifest(imus=[sensor])
+    run = read_run(folder.path, verify_hashes=True)
+    assert run.problems == [f"{name} is empty and counts as missing" for name in names]
+    assert (run.frames, run.imus, run.video) == (None, {}, None)
+    assert run.edges_ns.size == 0
+
+
+def test_an_empty_log_is_no_problem(folder):
+    (folder.path / "log.jsonl").write_bytes(b"")
+    folder.manifest()
+    assert read_run(folder.path, verify_hashes=True).problems == []
 
 
 def test_an_altered_file_fails_its_hash(folder):
