@@ -161,7 +161,9 @@ def _fuse_tight(
         lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=inertial.alignment,
     )  # fmt: skip
     n_rejected = int(np.count_nonzero(tight.led_rejected))
-    if n_rejected:
+    if n_rejected == 1:
+        problems.append("1 LED centroid disagrees with all the others and was left out")
+    elif n_rejected:
         problems.append(f"{n_rejected} LED centroids disagree with all the others and were left out")
     if not tight.check.agrees:
         problems.append(
