@@ -267,7 +267,9 @@ def choose_model(
     elif rejected:
         reason = f"central: {kind} does not predict better, though the {test} ({errors})"
     else:
-        reason = f"central: nothing speaks against one centre ({test}; {errors})"
+        reason = (
+            f"central: the dots do not rule out one centre ({test}, below {NOT_CENTRAL_P:g} would; {errors})"
+        )
     return _choice(chosen, reason, candidates, F[kind], p[kind]), chosen
 
 
