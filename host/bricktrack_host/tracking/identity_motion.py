@@ -31,14 +31,11 @@ class RunMotion:
         The poses given, and between them those of their spline; NaN where there is neither.
     within : LedMotion
         Of all n frames.
-    uv_px : ndarray, shape (n, n_leds, 2), px
-        Where the LEDs are seen, each at its own row's instant; NaN where they face away, or without a pose.
     """
 
     R_camera_brick: FloatArray
     t_camera_brick_mm: FloatArray
     within: LedMotion
-    uv_px: FloatArray
 
 
 def unknown_motion(uv_px: FloatArray, ray_model: RayModel) -> LedMotion:
@@ -80,20 +77,34 @@ def run_motion(
     R = np.where(has[:, None, None], R_camera_brick, between[0])
     t = np.where(has[:, None], t_camera_brick_mm, between[1])
     known = np.flatnonzero(all_finite(R, 2))
-    seen, _ = predict_brick(R[known], t[known], ray_model, brick_model, collar_mm=collar_mm)
-    v = np.full(uv_px.shape[:2], 0.5 * (mode.height - 1))
-    v[known] = np.where(np.isfinite(seen.uv_px[..., 1]), seen.uv_px[..., 1], v[known])
-    v = np.clip(np.where(np.isfinite(uv_px[..., 1]), uv_px[..., 1], v), 0, mode.height - 1)
+    v = uv_px[..., 1].copy()
+    unseen = known[~np.isfinite(v[known]).all(axis=1)]
+    shown, _ = predict_brick(R[unseen], t[unseen], ray_model, brick_model, collar_mm=collar_mm)
+    v[unseen] = np.where(np.isfinite(v[unseen]), v[unseen], shown.uv_px[..., 1])
+    v = np.clip(np.where(np.isfinite(v), v, 0.5 * (mode.height - 1)), 0, mode.height - 1)
     centre_ns = stamps_ns + int(np.rint(float(mode.row_delay_ns(0.5 * (mode.height - 1)))))
     within = motion_to_leds(
         centre_ns, stamps_ns[:, None] + np.rint(mode.row_delay_ns(v)).astype(np.int64), R, t
     )
-    R_led = R[known][:, None] @ matrix_from_rvec(within.rvec_brick_rad[known])
-    t_led_mm = t[known][:, None] + within.shift_camera_mm[known]
+    return RunMotion(R, t, within)
+
+
+def places_px(
+    motion: RunMotion,
+    frames: IntArray,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    collar_mm: float | None,
+) -> FloatArray:
+    """Return where frames that have poses show the LEDs, (m, n_leds, 2), px; NaN where they face away.
+
+    Each LED at its own row's instant.
+    """
+    R_led = motion.R_camera_brick[frames][:, None] @ matrix_from_rvec(motion.within.rvec_brick_rad[frames])
+    t_led_mm = motion.t_camera_brick_mm[frames][:, None] + motion.within.shift_camera_mm[frames]
     moved, _ = predict_brick(R_led, t_led_mm, ray_model, brick_model, collar_mm=collar_mm)
-    places = np.full(uv_px.shape, np.nan)
-    places[known] = np.where(moved.facing[..., None] > 0, moved.uv_px, np.nan)
-    return RunMotion(R, t, within, places)
+    return np.where(moved.facing[..., None] > 0, moved.uv_px, np.nan)
 
 
 def poses_between(stamps_ns: IntArray, R: FloatArray, t_mm: FloatArray) -> tuple[FloatArray, FloatArray]:

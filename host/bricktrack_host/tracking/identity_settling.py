@@ -10,7 +10,12 @@ from scipy.ndimage import maximum_filter, median_filter
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.identity_motion import RunMotion, turn_between, unknown_motion
+from bricktrack_host.tracking.identity_motion import (
+    RunMotion,
+    places_px,
+    turn_between,
+    unknown_motion,
+)
 from bricktrack_host.tracking.identity_newcomers import leave_out_fleeting, leave_out_newcomers
 from bricktrack_host.tracking.identity_smoothing import steady_poses
 from bricktrack_host.tracking.pattern import assign_predicted
@@ -196,12 +201,13 @@ def _identify_again(run: RunIdentities, tight_px: FloatArray, limit_rad: FloatAr
     frames = np.flatnonzero(known & (n_found < run.brick_model.n_leds))
     if frames.size == 0:
         return
+    places = places_px(motion, frames, run.ray_model, run.brick_model, collar_mm=run.collar_mm)
     new = np.full((frames.size, run.brick_model.n_leds), -1, dtype=np.int64)
     for row, i in enumerate(frames):
         begin, end = run.lights.first[i : i + 2]
         new[row] = assign_predicted(
             run.lights.uv_px[begin:end],
-            motion.uv_px[i],
+            places[row],
             gate_px=0.7 * run.radius_px if n_found[i] == 0 else run.gate_px,
             shift_limit_px=4 * run.radius_px if n_found[i] == 0 else run.gate_px,
         )

@@ -67,6 +67,7 @@ class RunIdentities:
             is_ambiguous=np.zeros(n, dtype=bool),
             is_strayed=np.zeros((n, n_leds), dtype=bool),
         )
+        self._motion: tuple[tuple[IntArray, FloatArray, FloatArray], RunMotion] | None = None
 
     @property
     def n_found(self) -> IntArray:
@@ -94,15 +95,23 @@ class RunIdentities:
 
     def motion(self, R_camera_brick: FloatArray | None = None) -> RunMotion:
         """Return the run's motion by the poses found, or with other attitudes; NaN: a frame tells nothing."""
-        return run_motion(
+        R = self.found.R_camera_brick if R_camera_brick is None else R_camera_brick
+        given = self.found.blob_of_led, R, self.found.t_camera_brick_mm
+        if self._motion is not None:
+            before, motion = self._motion
+            if all(np.array_equal(a, b, equal_nan=True) for a, b in zip(given, before, strict=True)):
+                return motion
+        motion = run_motion(
             self.stamps_ns,
             self.lights_of(np.arange(len(self.blobs))).uv_px,
-            self.found.R_camera_brick if R_camera_brick is None else R_camera_brick,
+            R,
             self.found.t_camera_brick_mm,
             self.ray_model,
             self.brick_model,
             collar_mm=self.collar_mm,
         )
+        self._motion = (given[0].copy(), R.copy(), given[2].copy()), motion
+        return motion
 
     def verify(
         self,
