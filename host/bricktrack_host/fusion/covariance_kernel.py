@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bricktrack_host.compiled import compiled_sums
+from bricktrack_host.compiled import compiled, compiled_sums
 
 N = 22  # states
 M = 9  # moving states: attitude, position, velocity
@@ -19,7 +19,7 @@ _OFFSET, _SKEW = 18, 19
 
 
 @compiled_sums
-def _step_forward(F: Any, A: Any, dt: float, width: int) -> None:
+def step_forward(F: Any, A: Any, dt: float, width: int) -> None:
     """Replace a matrix of rows ``width`` long by the transition times it: F holds the moving rows."""
     half = 0.5 * dt
     for j in range(width):
@@ -41,11 +41,11 @@ def _step_forward(F: Any, A: Any, dt: float, width: int) -> None:
 @compiled_sums
 def propagate(F: Any, P: Any, room: Any, dt: float, gyro: float, acc: float, bg: float, ba: float) -> None:
     """Replace P by F P F^T + Q; ``room``, as long as F, is to work in."""
-    _step_forward(F, P, dt, N)
+    step_forward(F, P, dt, N)
     for i in range(M):
         for j in range(N):
             room[j * M + i] = P[i * N + j]
-    _step_forward(F, room, dt, M)
+    step_forward(F, room, dt, M)
     for i in range(M):
         for j in range(M, N):
             P[j * N + i] = P[i * N + j]
@@ -186,3 +186,15 @@ def whiten_rows(L: Any, A: Any, n: int) -> None:
         scale = 1.0 / L[i, i]
         for j in range(N):
             A[o + j] *= scale
+
+
+@compiled
+def are_definite(covariance: Any) -> Any:
+    """Return which of covariances, shape (n, 6, 6), are positive definite, shape (n,); NaN is not."""
+    out, L = np.ones(len(covariance), dtype=np.bool_), np.empty((6, 6))
+    for i in range(len(covariance)):
+        L[:] = covariance[i]
+        factor(L, 6)
+        for j in range(6):
+            out[i] &= L[j, j] > 0.0
+    return out

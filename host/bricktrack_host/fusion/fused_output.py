@@ -1,12 +1,16 @@
 """The smoothed motion at any instants between the filter's nodes: pose, twist, covariance, flags."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_host.fusion.covariance_kernel import are_definite
 from bricktrack_host.fusion.fusion_problem import Nodes, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.smoother import (
     BA,
     BG,
@@ -26,6 +30,7 @@ from bricktrack_host.tracks import FusedTrack
 
 # The velocity comes from poses at the same stamps: its own share that is unsure, in any direction.
 _UNSURE_VELOCITY = 0.3
+_SLACK_S = 1e-6
 
 
 def sample_motion(
@@ -51,77 +56,31 @@ def sample_motion(
     spread as white noise would: attitude linearly, velocity and position along the cubic between both ends.
     A filter's state (``is_smoothed`` false) knows nothing of the node after and is only carried on.
     """
-    n = len(nodes.t_s)
-    t_cam = seconds_since(output_t_ns, run.signal.epoch_ns)
-    x0 = estimate.state.x[0, b]
-    tau, rate = float(x0[TAU]), float(x0[SKEW])
-    t = t_cam + tau + rate * (t_cam - run.t_mid_s)
-    slack = 1e-6
-    outside = (t < nodes.t_s[0] - slack) | (t > nodes.t_s[-1] + slack)
-    t = np.clip(t, nodes.t_s[0], nodes.t_s[-1])
-    k = np.clip(np.searchsorted(nodes.t_s, t, side="right") - 1, 0, n - 2)
-    x, R = estimate.state.x[k, b], estimate.state.R[k, b]
-    lag_s = float(x0[LAG])
-    dt = t - nodes.t_s[k]
-    part = run.signal.increments(
-        nodes.t_s[k], t, gyro_bias_radps=x[:, BG], acc_bias_mps2=x[:, BA], acc_lag_s=lag_s
-    )
-    h = dt[:, None]
-    R_t = R @ part.R
-    part_v, part_p = _camera_part(run, nodes.t_s[k], t, lag_s)
-    v = x[:, VEL] + h * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dv_mps) + part_v
-    p = x[:, POS] + h * x[:, VEL] + 0.5 * h**2 * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dp_m) + part_p
-    cov = estimate.covariance[k, b]
-    if is_smoothed:
-        span = nodes.t_s[k + 1] - nodes.t_s[k]
-        whole = run.signal.increments(
-            nodes.t_s[k],
-            nodes.t_s[k + 1],
-            gyro_bias_radps=x[:, BG],
-            acc_bias_mps2=x[:, BA],
-            acc_lag_s=lag_s,
-        )
-        s, a = span[:, None], (dt / span)[:, None]
-        after_x, after_R = estimate.state.x[k + 1, b], estimate.state.R[k + 1, b]
-        miss_turn = rvec_from_matrix(np.swapaxes(R @ whole.R, 1, 2) @ after_R)
-        whole_v, whole_p = _camera_part(run, nodes.t_s[k], nodes.t_s[k + 1], lag_s)
-        miss_v = (
-            after_x[:, VEL]
-            - (x[:, VEL] + s * x[:, GRAV] + np.einsum("nij,nj->ni", R, whole.dv_mps))
-            - whole_v
-        )
-        miss_p = after_x[:, POS] - (
-            x[:, POS]
-            + s * x[:, VEL]
-            + 0.5 * s**2 * x[:, GRAV]
-            + np.einsum("nij,nj->ni", R, whole.dp_m)
-            + whole_p
-        )
-        R_t = R_t @ matrix_from_rvec(a * miss_turn)
-        p = p + (3 * a**2 - 2 * a**3) * miss_p + s * (a**3 - a**2) * miss_v
-        v = v + 6 * (a - a**2) / s * miss_p + (3 * a**2 - 2 * a) * miss_v
-        cov = (1 - a[..., None]) * cov + a[..., None] * estimate.covariance[k + 1, b]
-    omega = run.signal.gyro_at(t) - x[:, BG]
-    state = State(R_t, np.concatenate([x[:, :3], p, v, x[:, 9:]], axis=1))
-    zero = np.zeros(len(t))
-    R_out, p_out, H = observe(state, omega, run.lever_arm_m, t_cam - run.t_mid_s, zero)
+    at = _carry(run, nodes, estimate.state, b, output_t_ns, is_smoothed=is_smoothed)
+    zero = np.zeros(len(at.t_s))
+    R_out, p_out, H = observe(at.state, at.omega_radps, run.lever_arm_m, at.t_cam_s - run.t_mid_s, zero)
     H = H[..., estimate.of]
+    cov = estimate.covariance[at.node, b]
+    if is_smoothed:
+        a = at.share[:, None, None]
+        cov = (1 - a) * cov + a * estimate.covariance[at.node + 1, b]
     P = H @ cov @ np.swapaxes(H, 1, 2)
-    _add_bridge(P, problem, k, b, dt, nodes, is_smoothed=is_smoothed)
+    _add_bridge(P, problem, b, at, is_smoothed=is_smoothed)
     P = P + common
-    v_out = v - np.einsum("nij,nj->ni", R_t, np.cross(omega, run.lever_arm_m))
+    R_t, omega = at.state.R, at.omega_radps
+    v_out = at.state.x[:, VEL] - np.einsum("nij,nj->ni", R_t, np.cross(omega, run.lever_arm_m))
 
     P = 0.5 * (P + np.swapaxes(P, 1, 2))
     P[:, 3:] *= 1e3
     P[:, :, 3:] *= 1e3
-    flags = _flags(run, t_cam, t, seen_cam_s, settings)
-    flags[outside] |= int(PoseFlag.EXTRAPOLATED)
+    flags = _flags(run, at.t_cam_s, at.t_s, seen_cam_s, settings)
+    flags[at.is_outside] |= int(PoseFlag.EXTRAPOLATED)
     variance = np.diagonal(P, axis1=1, axis2=2)
     unsure = (variance[:, 3:].max(axis=1) > settings.max_position_sd_mm**2) | (
         variance[:, :3].max(axis=1) > settings.max_rotation_sd_rad**2
     )
     # What rounding has made less than nothing says nothing.
-    lost = outside | unsure | ~(variance > 0).all(axis=1)
+    lost = at.is_outside | unsure | ~are_definite(P)
     flags[lost] |= int(PoseFlag.NO_POSE)
     t_mm, v_mmps = 1e3 * p_out, 1e3 * v_out
     R_out, omega = R_out.copy(), omega.copy()
@@ -136,17 +95,102 @@ def sample_motion(
         covariance=P,
         flags=flags,
     )
-    return track if run.camera is None else run.camera.to_camera(track, t)
+    return track if run.camera is None else run.camera.to_camera(track, at.t_s)
 
 
-def _camera_part(
-    run: Run, start_s: FloatArray, end_s: FloatArray, lag_s: float
+def sample_poses(
+    run: Run, nodes: Nodes, states: State, b: int, t_ns: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what a moving camera adds to velocity and displacement between instants, shape (n, 3) each."""
-    if run.camera is None:
-        return np.zeros((len(start_s), 3)), np.zeros((len(start_s), 3))
-    felt = run.camera.increments(start_s, end_s, acc_lag_s=lag_s)
-    return felt[:, 0], felt[:, 1]
+    """Return smoothed rotations and positions, mm, of run ``b`` of a batch at instants of camera time.
+
+    As by `sample_motion`, whether sure or not; NaN beyond the nodes. The camera stands still.
+    """
+    at = _carry(run, nodes, states, b, t_ns, is_smoothed=True)
+    R, t_mm = at.state.R, 1e3 * (at.state.x[:, POS] - at.state.R @ run.lever_arm_m)
+    R[at.is_outside], t_mm[at.is_outside] = np.nan, np.nan
+    return R, t_mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Carried:
+    """States at n instants, and where these lie between the nodes.
+
+    Attributes
+    ----------
+    t_cam_s, t_s : ndarray, shape (n,)
+        In camera time, and in IMU time, the latter held within the nodes.
+    is_outside : ndarray of bool, shape (n,)
+        Whether it had to be held.
+    node : ndarray of int64, shape (n,)
+        The one before.
+    since_s, share : ndarray, shape (n,)
+        Time since then, and over the whole step.
+    state : State, leading shape (n,)
+    omega_radps : ndarray, shape (n, 3)
+    """
+
+    t_cam_s: FloatArray
+    t_s: FloatArray
+    is_outside: BoolArray
+    node: IntArray
+    since_s: FloatArray
+    share: FloatArray
+    state: State
+    omega_radps: FloatArray
+
+
+def _carry(run: Run, nodes: Nodes, states: State, b: int, t_ns: IntArray, *, is_smoothed: bool) -> _Carried:
+    """Return the states at instants of camera time, see `sample_motion`."""
+    t_cam = seconds_since(t_ns, run.signal.epoch_ns)
+    x0 = states.x[0, b]
+    t = t_cam + float(x0[TAU]) + float(x0[SKEW]) * (t_cam - run.t_mid_s)
+    outside = (t < nodes.t_s[0] - _SLACK_S) | (t > nodes.t_s[-1] + _SLACK_S)
+    t = np.clip(t, nodes.t_s[0], nodes.t_s[-1])
+    k = np.clip(np.searchsorted(nodes.t_s, t, side="right") - 1, 0, len(nodes.t_s) - 2)
+    x = states.x[k, b]
+    start_s, span = nodes.t_s[k], nodes.t_s[k + 1] - nodes.t_s[k]
+    since = t - start_s
+    R, v, p = _carried(run, State(states.R[k, b], x), start_s, t, float(x0[LAG]))
+    if is_smoothed:
+        miss_turn, miss_v, miss_p = _misses(run, nodes, states, b, k)
+        s, a = span[:, None], (since / span)[:, None]
+        R = R @ matrix_from_rvec(a * miss_turn)
+        p = p + (3 * a**2 - 2 * a**3) * miss_p + s * (a**3 - a**2) * miss_v
+        v = v + 6 * (a - a**2) / s * miss_p + (3 * a**2 - 2 * a) * miss_v
+    omega = run.signal.gyro_at(t) - x[:, BG]
+    x[:, POS], x[:, VEL] = p, v
+    return _Carried(t_cam, t, outside, k, since, since / span, State(R, x), omega)
+
+
+def _carried(
+    run: Run, start: State, start_s: FloatArray, end_s: FloatArray, lag_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return attitude, velocity and position to which the inertial samples carry states, shape (n,)."""
+    x, R, h = start.x, start.R, (end_s - start_s)[:, None]
+    part = run.signal.increments(
+        start_s, end_s, gyro_bias_radps=x[:, BG], acc_bias_mps2=x[:, BA], acc_lag_s=lag_s
+    )
+    v = x[:, VEL] + h * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dv_mps)
+    p = x[:, POS] + h * x[:, VEL] + 0.5 * h**2 * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dp_m)
+    if run.camera is not None:
+        felt = run.camera.increments(start_s, end_s, acc_lag_s=lag_s)
+        v, p = v + felt[:, 0], p + felt[:, 1]
+    return R @ part.R, v, p
+
+
+def _misses(
+    run: Run, nodes: Nodes, state: State, b: int, k: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return turn, velocity and position from where the samples carry nodes ``k`` to the nodes after them.
+
+    Many instants lie in one step, whose miss is theirs.
+    """
+    step, of = np.unique(k, return_inverse=True)
+    start = State(state.R[step, b], state.x[step, b])
+    R, v, p = _carried(run, start, nodes.t_s[step], nodes.t_s[step + 1], float(state.x[0, b, LAG]))
+    after_R, after_x = state.R[step + 1, b], state.x[step + 1, b]
+    turn = rvec_from_matrix(np.swapaxes(R, 1, 2) @ after_R)
+    return turn[of], (after_x[:, VEL] - v)[of], (after_x[:, POS] - p)[of]
 
 
 def common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> FloatArray:
@@ -213,15 +257,11 @@ def unsure_times(
     return covariance, flags
 
 
-def _add_bridge(
-    P: FloatArray, problem: Problem, k: IntArray, b: int, dt: FloatArray, nodes: Nodes, *, is_smoothed: bool
-) -> None:
+def _add_bridge(P: FloatArray, problem: Problem, b: int, at: _Carried, *, is_smoothed: bool) -> None:
     """Add what inertial noise makes unsure between two known nodes (or after one), in place."""
-    span = nodes.t_s[k + 1] - nodes.t_s[k]
-    a = dt / span
-    q_turn, q_acc = problem.gyro_var[k, b], problem.acc_var[k, b]
-    turn = q_turn * dt * ((1 - a) if is_smoothed else 1.0)
-    shift = q_acc * dt**3 / 3 * ((1 - a) ** 3 if is_smoothed else 1.0)
+    left = 1 - at.share if is_smoothed else 1.0
+    turn = problem.gyro_var[at.node, b] * at.since_s * left
+    shift = problem.acc_var[at.node, b] * at.since_s**3 / 3 * left**3
     i = np.arange(3)
     P[:, i, i] += turn[:, None]
     P[:, 3 + i, 3 + i] += shift[:, None]
@@ -245,10 +285,9 @@ def _flags(
     other = np.minimum(i, len(frames) - 1)
     period = float(np.median(np.diff(frames))) if len(frames) > 1 else np.inf
     away = np.minimum(np.abs(t_cam - frames[other]), np.abs(t_cam - frames[i - 1]))
-    slack = 1e-6
     marks = {
         PoseFlag.DROPOUT: away > 1.5 * period,
-        PoseFlag.EXTRAPOLATED: (t_cam < frames[0] - slack) | (t_cam > frames[-1] + slack),
+        PoseFlag.EXTRAPOLATED: (t_cam < frames[0] - _SLACK_S) | (t_cam > frames[-1] + _SLACK_S),
         PoseFlag.IMPACT: _near_sample(signal, t_imu, signal.acc_impact_mps2 > settings.impact_mps2),
         PoseFlag.CLIPPED: _near_sample(signal, t_imu, signal.clip_sd_mps2 > 0),
         PoseFlag.IMU_GAP: signal.in_gap(t_imu),

@@ -10,7 +10,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import skew
 from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, NoiseLevel, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_signal import seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial_noise import noise_parts
 from bricktrack_host.fusion.observation_kernel import LedArrays
 from bricktrack_host.fusion.smoother import Estimate, Problem
@@ -62,10 +62,10 @@ class SeenLeds:
         """Return some of the rows."""
         return SeenLeds(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-    def instants_ns(self) -> IntArray:
-        """Return the middle of each one's light, one spread before and one after, shape (3, m)."""
+    def beside_ns(self) -> IntArray:
+        """Return one spread before the middle of each one's light and one after, shape (2, m)."""
         aside = np.rint(self.spread_ns).astype(np.int64)
-        return np.stack([self.t_ns, self.t_ns - aside, self.t_ns + aside])
+        return np.stack([self.t_ns - aside, self.t_ns + aside])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,23 +100,30 @@ class Pictured:
 
 
 def picture(
-    leds: SeenLeds, motion: tuple[FusedTrack, FusedTrack, FusedTrack], ray_model: RayModel, brick: BrickModel
+    leds: SeenLeds,
+    motion: FusedTrack,
+    beside: tuple[FloatArray, FloatArray],
+    ray_model: RayModel,
+    brick: BrickModel,
 ) -> Pictured:
-    """Predict seen LEDs for the motion at their `SeenLeds.instants_ns`.
+    """Predict seen LEDs for the motion at their instants, and rotations and positions, mm, at `beside_ns`.
 
     A brick that is accelerated is not, on the mean over the time that its light is gathered, where it is in
     the middle: by half the spread's square times the acceleration. The mean of the pictures a spread before
     and after shows as much.
     """
-    middle, *beside = motion
-    prediction, J = _predict(leds, middle, ray_model, brick)
-    mean_px = 0.5 * sum(_predict(leds, track, ray_model, brick)[0].uv_px for track in beside)
-    twist = np.concatenate([middle.omega_brick_radps, middle.v_camera_mmps], axis=1)
+    R, t_mm = motion.R_camera_brick, motion.t_camera_brick_mm
+    prediction = _predict(leds, R, t_mm, ray_model, brick)
+    before_px, after_px = (
+        _predict(leds, *pose, ray_model, brick).uv_px for pose in zip(*beside, strict=True)
+    )
+    J = _by_pose(prediction, leds, R, brick)
+    twist = np.concatenate([motion.omega_brick_radps, motion.v_camera_mmps], axis=1)
     mode = ray_model.sensor_mode
     return Pictured(
-        R_camera_brick=middle.R_camera_brick,
-        t_camera_brick_mm=middle.t_camera_brick_mm,
-        residual_px=leds.uv_px - mean_px,
+        R_camera_brick=R,
+        t_camera_brick_mm=t_mm,
+        residual_px=leds.uv_px - 0.5 * (before_px + after_px),
         J_px=J,
         profile_shift_px=prediction.model_shift_px,
         from_centre_px=prediction.uv_px - 0.5 * np.array([mode.width - 1, mode.height - 1]),
@@ -126,21 +133,25 @@ def picture(
 
 
 def _predict(
-    leds: SeenLeds, motion: FusedTrack, ray_model: RayModel, brick: BrickModel
-) -> tuple[LedPrediction, FloatArray]:
-    """Return predictions, shape (m,), and derivatives by the pose, shape (m, 2, 6), of single LEDs."""
+    leds: SeenLeds, R: FloatArray, t_mm: FloatArray, ray_model: RayModel, brick: BrickModel
+) -> LedPrediction:
+    """Return predictions of single LEDs, shape (m,), each for its own pose."""
     P, N = brick.led_positions_mm[leds.led], brick.led_axes[leds.led]
-    R = motion.R_camera_brick
-    prediction = predict_leds(
-        np.einsum("mij,mj->mi", R, P) + motion.t_camera_brick_mm,
+    return predict_leds(
+        np.einsum("mij,mj->mi", R, P) + t_mm,
         np.einsum("mij,mj->mi", R, N),
         brick.led_radii_mm[leds.led],
         ray_model,
         collar_mm=collar_of(brick),
         shift_sd_per_radius=shift_per_radius(collar_of(brick), brick),
     )
+
+
+def _by_pose(prediction: LedPrediction, leds: SeenLeds, R: FloatArray, brick: BrickModel) -> FloatArray:
+    """Return the derivatives of single LEDs' pictures by their poses, shape (m, 2, 6)."""
+    P, N = brick.led_positions_mm[leds.led], brick.led_axes[leds.led]
     turn = prediction.J_px_per_mm @ (R @ skew(P)) + prediction.J_px_per_axis @ (R @ skew(N))
-    return prediction, np.concatenate([-turn, prediction.J_px_per_mm], axis=2)
+    return np.concatenate([-turn, prediction.J_px_per_mm], axis=2)
 
 
 def led_arrays(
@@ -199,14 +210,23 @@ def led_arrays(
 def led_chi2(problem: Problem, estimate: Estimate) -> FloatArray:
     """Return how far each LED lies from what all the others say, over its covariance (2 degrees of freedom).
 
-    See `noise_choice.frame_chi2`; of one run that is a batch alone.
+    See `noise_choice.frame_chi2`; of one run that is a batch alone. NaN where rounding leaves no covariance
+    to judge by.
     """
     leds = problem.leds
     if leds is None:
         raise ValueError("the problem has no LEDs")
     y, A = estimate.led_residual_px, estimate.led_cov_px2
     given = leds.cov_px2 * leds.inflation[:, None, None]
-    rest = np.linalg.inv(1.02 * given - A)
+    rest = _inverse(1.02 * given - A)
     S = leds.cov_px2 + np.where(leds.use[:, None, None], A + A @ rest @ A, A)
     y = np.where(leds.use[:, None], (given @ rest @ y[..., None])[..., 0], y)
-    return np.asarray((y * np.linalg.solve(S, y[..., None])[..., 0]).sum(axis=1))
+    return np.asarray(np.einsum("mi,mij,mj->m", y, _inverse(S), y))
+
+
+def _inverse(S: FloatArray) -> FloatArray:
+    """Return the inverses of covariances, shape (m, 2, 2); NaN of those that are not positive definite."""
+    a, b, c = S[:, 0, 0], 0.5 * (S[:, 0, 1] + S[:, 1, 0]), S[:, 1, 1]
+    det = a * c - b * b
+    det = np.where((a > 0) & (det > 0), det, np.nan)
+    return np.stack([c, -b, -b, a], axis=1).reshape(-1, 2, 2) / det[:, None, None]

@@ -6,13 +6,14 @@ residuals, and what of the inertial samples is error from how likely the LEDs ar
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, NoiseLevel, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.inertial_noise import noise_parts
+from bricktrack_host.fusion.inertial_noise import NoiseParts, noise_parts
 from bricktrack_host.fusion.led_measurements import SeenLeds
 from bricktrack_host.fusion.smoother import Problem, score_noise
 from bricktrack_host.fusion.smoother_kernel import NIS_CAP
@@ -45,9 +46,9 @@ def still_sightings(leds: SeenLeds) -> BoolArray:
 def centroid_scales(chi2: FloatArray, still: BoolArray, use: BoolArray, scale: FloatArray) -> FloatArray:
     """Return what the stated sd of the centroids is to be multiplied by, shape (2,): moving, and still.
 
-    ``chi2``: squared residuals of each LED to all others, over covariances with ``scale``.
+    ``chi2``: squared residuals of each LED to all others, over covariances with ``scale``; NaN says nothing.
     """
-    out = scale.copy()
+    out, use = scale.copy(), use & np.isfinite(chi2)
     enough = [int((use & (still == c)).sum()) >= _MIN_SIGHTINGS for c in (False, True)]
     for i, c in enumerate((False, True)):
         part = use & (still == c) if enough[i] else use
@@ -122,8 +123,12 @@ def choose_inertial_noise(
     One kind after the other, down as long as each step earns its price, or else up.
     """
 
+    @cache
+    def parts_of(impact: int) -> NoiseParts:
+        return noise_parts(run.signal, nodes.t_s, lin, InertialNoise(impact=impact).settings(settings))
+
     def score(choice: InertialNoise) -> float:
-        parts = noise_parts(run.signal, nodes.t_s, lin, choice.settings(settings))
+        parts = parts_of(choice.impact)
         gyro, acc = choice.levels(stated)
         return _log_likelihood(problem, parts.gyro(gyro), parts.acc(acc)) - _EARN_PER_STEP * choice.n_steps
 

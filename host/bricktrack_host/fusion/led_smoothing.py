@@ -4,10 +4,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
-from bricktrack_host.fusion.fused_output import sample_motion
+from bricktrack_host.fusion.fused_output import sample_motion, sample_poses
 from bricktrack_host.fusion.fusion_problem import Nodes, NoiseLevel, Run, build_problem, place_nodes
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_measurements import Pictured, SeenLeds, led_arrays, led_chi2, picture
@@ -130,11 +130,8 @@ def _pass(
 ) -> _Pass:
     """Smooth once, with pictures predicted for the motion ``now``."""
     settings = belief.settings
-    tracks = [_motion_at(now, t_ns, first.run.t_cam_s, settings) for t_ns in leds.instants_ns()]
-    placed = np.all([np.isfinite(track.t_camera_brick_mm).all(axis=1) for track in tracks], axis=0)
-    leds, use = leds.take(placed), use[placed]
-    middle, before, after = (_rows(track, placed) for track in tracks)
-    pictured = picture(leds, (middle, before, after), ray_model, brick_model)
+    leds, pictured, placed = _pictured(leds, now, first.run.t_cam_s, ray_model, brick_model, settings)
+    use = use[placed]
     off_px = belief.errors.in_picture_px(leds, pictured, brick_model.n_leds)
     pictured = replace(pictured, residual_px=pictured.residual_px - off_px)
     still, use = still_sightings(leds), use & pictured.is_facing
@@ -159,16 +156,27 @@ def _pass(
     return _Pass(leds, pictured, still, use, states, led_chi2(problem, estimate))
 
 
-def _motion_at(s: Smoothed, t_ns: IntArray, seen_cam_s: FloatArray, settings: FusionSettings) -> FusedTrack:
-    """Return the smoothed motion at instants, NaN where it is not known."""
-    return sample_motion(
-        s.run, s.nodes, s.problem, s.estimate, s.b, output_t_ns=t_ns, seen_cam_s=seen_cam_s,
+def _pictured(
+    leds: SeenLeds,
+    s: Smoothed,
+    seen_cam_s: FloatArray,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    settings: FusionSettings,
+) -> tuple[SeenLeds, Pictured, BoolArray]:
+    """Return the LEDs at whose instants a smoothed motion is known, their pictures, and which those are."""
+    motion = sample_motion(
+        s.run, s.nodes, s.problem, s.estimate, s.b, output_t_ns=leds.t_ns, seen_cam_s=seen_cam_s,
         common=np.zeros((6, 6)), settings=settings, is_smoothed=True,
     )  # fmt: skip
-
-
-def _rows(track: FusedTrack, rows: BoolArray) -> FusedTrack:
-    return FusedTrack(*(getattr(track, f.name)[rows] for f in fields(track)))
+    beside_ns = leds.beside_ns()
+    R, t_mm = sample_poses(s.run, s.nodes, s.estimate.state, s.b, beside_ns.ravel())
+    R, t_mm = R.reshape(*beside_ns.shape, 3, 3), t_mm.reshape(*beside_ns.shape, 3)
+    all_mm = np.concatenate([motion.t_camera_brick_mm, *t_mm], axis=1)
+    placed = np.asarray(np.isfinite(all_mm).all(axis=1))
+    known = FusedTrack(*(getattr(motion, f.name)[placed] for f in fields(motion)))
+    leds = leds.take(placed)
+    return leds, picture(leds, known, (R[:, placed], t_mm[:, placed]), ray_model, brick_model), placed
 
 
 def _without_frames(run: Run) -> Run:

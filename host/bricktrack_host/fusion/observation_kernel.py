@@ -9,7 +9,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.compiled import compiled, compiled_sums
-from bricktrack_host.fusion.covariance_kernel import N as N
+from bricktrack_host.fusion.covariance_kernel import N
 from bricktrack_host.fusion.rotation_kernel import turn_by, write_rotation_vector
 
 POSE_REACH, LED_REACH = 6, 18
@@ -198,22 +198,3 @@ def place_led(
             turned = j0 * H6[j] + j1 * H6[N + j] + j2 * H6[2 * N + j]
             shifted = j3 * H6[3 * N + j] + j4 * H6[4 * N + j] + j5 * H6[5 * N + j]
             H[i * N + j] = turned + shifted
-
-
-@compiled
-def observe_led(
-    leds: LedArrays,
-    m: int,
-    R: Any,
-    x: Any,
-    arm: Any,
-    bg_lin: Any,
-    off_lin: Any,
-    tau_lin: float,
-    skew_lin: float,
-    H: Any,
-    y: Any,
-) -> None:
-    """Write the same as `place_led`, its Jacobian of shape (2, 22)."""
-    room = observation_room()
-    place_led(leds, m, R, x, arm, bg_lin, off_lin, tau_lin, skew_lin, H.ravel(), y, room)

@@ -9,7 +9,7 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_host.compiled import compiled
-from bricktrack_host.fusion.smoother_kernel import RunArrays, transition
+from bricktrack_host.fusion.transition_kernel import RunArrays, transition
 
 _N = 22
 _MOVING = 9

@@ -3,7 +3,7 @@
 Modified Bryson-Frazier form (Bierman 1973): with lambda and Lambda the gradient and the Hessian of what comes
 later, taken at the filtered state x, P, the smoothed state is x - P lambda and its covariance P - P Lambda P.
 Nothing is inverted, and only one stretch of filtered states is in memory at a time: it is made again from the
-state before it.
+state before it. A variance of which the difference leaves nothing is NaN, never a number.
 """
 
 from typing import Any
@@ -31,6 +31,7 @@ from bricktrack_host.fusion.smoother_kernel import (
     Kept,
     copy_state,
     forward_stretch,
+    measurements_of,
     room_for,
     room_to_work,
 )
@@ -100,6 +101,21 @@ def _write_state(kept: Kept, i: int, gradient: Any, dx: Any, R: Any, x: Any) -> 
 
 
 @compiled_sums
+def _left_of(P: Any, r: int, taken: float) -> float:
+    """Return what is left of the variance of state ``r``; NaN where rounding leaves nothing of it.
+
+    Zero is the variance of a state that was known from the start: all of its row is zero.
+    """
+    left = P[r * N + r] - taken
+    if left > 0.0:
+        return float(left)
+    for j in range(N):
+        if P[r * N + j] != 0.0:
+            return np.nan
+    return 0.0
+
+
+@compiled_sums
 def _write_covariance(P: Any, hessian: Any, of: IntArray, rows: Any, work: Any, out: Any) -> None:
     """Write the smoothed covariance of the states ``of``, shape (c, c)."""
     for r in range(len(of)):
@@ -108,7 +124,9 @@ def _write_covariance(P: Any, hessian: Any, of: IntArray, rows: Any, work: Any, 
     _smoothed(rows, len(of), hessian, work, out)
     for r in range(len(of)):
         for j in range(len(of)):
-            out[r, j] = rows[r * N + of[j]] - out[r, j]
+            if j != r:
+                out[r, j] = rows[r * N + of[j]] - out[r, j]
+        out[r, r] = _left_of(P, of[r], out[r, r])
 
 
 @compiled_sums
@@ -116,15 +134,7 @@ def _write_variance(P: Any, hessian: Any, work: Any, out: Any) -> None:
     """Write the smoothed variance of every state, shape (22,)."""
     rows_times(P, N, _ALL, hessian, work)
     for r in range(N):
-        out[r] = P[r * N + r] - dot(work, r, P, r)
-
-
-@compiled_sums
-def _measurements_of(run: RunArrays, start: int, stop: int) -> int:
-    n = run.leds.first[stop, 0] - run.leds.first[start, 0]
-    for k in range(start, stop):
-        n += run.has_frame[k]
-    return int(n)
+        out[r] = _left_of(P, r, dot(work, r, P, r))
 
 
 @compiled
@@ -166,7 +176,7 @@ def backward_pass(
     room, observation = room_to_work(), observation_room()
     for c in range(len(R_before) - 1, -1, -1):
         start, stop = c * CHUNK, min((c + 1) * CHUNK, n_nodes)
-        kept = room_for(stop - start, _measurements_of(run, start, stop))
+        kept = room_for(stop - start, measurements_of(run, start, stop))
         R[:], x[:], P[:] = R_before[c], x_before[c], P_before[c]
         forward_stretch(run, gyro_var, acc_var, start, stop, R, x, P, nis, inflation, room, kept)
         for k in range(stop - 1, start - 1, -1):
@@ -188,7 +198,8 @@ def backward_pass(
                 _smoothed(HP, 2, hessian, work, taken)
                 for r in range(2):
                     for j in range(2):
-                        led_cov_px2[led, r, j] = dot(HP, r, H, j) - taken[r, j]
+                        left = dot(HP, r, H, j) - taken[r, j]
+                        led_cov_px2[led, r, j] = left if r != j or left > 0.0 else np.nan
             if not is_smoothed:
                 continue
             for m in range(kept.first[i + 1] - 1, kept.first[i] - 1, -1):

@@ -12,6 +12,7 @@ from bricktrack_host.compiled import compiled, compiled_sums
 from bricktrack_host.fusion.covariance_kernel import (
     F_SIZE,
     SIZE,
+    M,
     N,
     dot,
     factor,
@@ -19,9 +20,6 @@ from bricktrack_host.fusion.covariance_kernel import (
     take_off,
     whiten,
     whiten_rows,
-)
-from bricktrack_host.fusion.covariance_kernel import (
-    M as M,
 )
 from bricktrack_host.fusion.observation_kernel import (
     LED_REACH,
@@ -32,10 +30,7 @@ from bricktrack_host.fusion.observation_kernel import (
     place_led,
 )
 from bricktrack_host.fusion.rotation_kernel import turn_by
-from bricktrack_host.fusion.transition_kernel import RunArrays as RunArrays
-from bricktrack_host.fusion.transition_kernel import move_to
-from bricktrack_host.fusion.transition_kernel import step_to as step_to
-from bricktrack_host.fusion.transition_kernel import transition as transition
+from bricktrack_host.fusion.transition_kernel import RunArrays, move_to
 
 CHUNK = 64  # nodes between the states that are kept on the way forwards
 NIS_CAP = 100.0  # so that an outlier does not choose the noise
@@ -55,6 +50,8 @@ class Kept(NamedTuple):
     n_rows : ndarray of int64, shape (m,)
     H, HP, y : ndarray, shape (m, 6 N), (m, 6 N), (m, 6)
         Of each measurement, whitened by its innovation: L^-1 H, L^-1 H P, L^-1 y.
+    L : ndarray, shape (m, 6, 6)
+        Root of the innovation's covariance; only the lower triangle of the first ``n_rows`` is written.
     """
 
     R: FloatArray
@@ -65,6 +62,7 @@ class Kept(NamedTuple):
     H: FloatArray
     HP: FloatArray
     y: FloatArray
+    L: FloatArray
 
 
 class Room(NamedTuple):
@@ -107,7 +105,17 @@ def room_for(n_nodes: int, n_measurements: int) -> Kept:
         np.empty((m, 6 * N)),
         np.empty((m, 6 * N)),
         np.empty((m, 6)),
+        np.empty((m, 6, 6)),
     )
+
+
+@compiled_sums
+def measurements_of(run: RunArrays, start: int, stop: int) -> int:
+    """Return for how many measurements nodes from ``start`` to before ``stop`` need room."""
+    n = run.leds.first[stop, 0] - run.leds.first[start, 0]
+    for k in range(start, stop):
+        n += run.has_frame[k]
+    return int(n)
 
 
 @compiled_sums
@@ -155,6 +163,8 @@ def _correct(
         kept.n_rows[m] = n
         for i in range(n):
             kept.y[m, i] = white[i]
+            for j in range(i + 1):
+                kept.L[m, i, j] = S[i, j]
         for j in range(n * N):
             kept.H[m, j], kept.HP[m, j] = H[j], HP[j]
     return nis, log_det, inflation

@@ -142,7 +142,7 @@ class StandingWay:
         q, c = own.shape[2], len(of)
         self._run, self._of, self._R = passed.runs[0], of, np.empty((n_nodes, 3, 3))
         self._rows, self._changed = np.empty((n_nodes, c, N_STATES)), np.empty((n_nodes, c, q))
-        self._H, self._HP = np.zeros((m, 2, N_STATES)), np.zeros((m, 2, N_STATES))
+        self._H, self._HP = np.empty((m, 2 * N_STATES)), np.empty((m, 2 * N_STATES))
         self._y, self._dy = np.empty((m, 2)), np.empty((m, 2, q))
         carry_forward(
             self._run, np.ascontiguousarray(problem.gyro_var[:, 0]),

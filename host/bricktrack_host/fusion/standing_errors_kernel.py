@@ -2,47 +2,44 @@
 
 The filter is run once more, LED by LED; beside each state goes its derivative by every error, and back again
 by the adjoint, as in `sensor_errors_kernel`. What an LED says is whitened: divided by the root of its
-innovation's covariance.
+innovation's covariance. Matrices of 22 rows are flat inside, as in `covariance_kernel`.
 """
 
 from typing import Any
 
 import numpy as np
 
-from bricktrack_host.compiled import compiled
-from bricktrack_host.fusion.observation_kernel import N, observe_led
-from bricktrack_host.fusion.rotation_kernel import turn_by
+from bricktrack_host.compiled import compiled, compiled_sums
+from bricktrack_host.fusion.covariance_kernel import F_SIZE, M, N, step_back, step_forward
 from bricktrack_host.fusion.sensor_errors_kernel import drive
-from bricktrack_host.fusion.smoother_kernel import M, RunArrays, step_to, transition
+from bricktrack_host.fusion.smoother_kernel import (
+    CHUNK,
+    Kept,
+    forward_stretch,
+    measurements_of,
+    room_for,
+    room_to_work,
+)
+from bricktrack_host.fusion.transition_kernel import RunArrays, transition
 
 
-@compiled
-def _take_in(run: RunArrays, i: int, R: Any, x: Any, P: Any, H: Any, HP: Any, y: Any, root: Any) -> None:
-    """Take in LED ``i`` with the covariance that the filter gave it, in place.
-
-    H, HP and y, shape (2, 22), (2, 22), (2,), are left whitened; ``root``, shape (2, 2), is what by.
-    """
-    leds = run.leds
-    observe_led(leds, i, R, x, run.arm_m, run.bg_lin, run.off_lin, run.tau_lin, run.skew_lin, H, y)
-    HP[:] = H @ P
-    S = HP @ H.T + leds.inflation[i] * leds.cov_px2[i]
-    root[0, 0] = np.sqrt(S[0, 0])
-    root[1, 0] = S[1, 0] / root[0, 0]
-    root[1, 1] = np.sqrt(S[1, 1] - root[1, 0] ** 2)
-    root[0, 1] = 0.0
-    y[0] /= root[0, 0]
-    y[1] = (y[1] - root[1, 0] * y[0]) / root[1, 1]
-    for j in range(N):
-        H[0, j] /= root[0, 0]
-        H[1, j] = (H[1, j] - root[1, 0] * H[0, j]) / root[1, 1]
-        HP[0, j] /= root[0, 0]
-        HP[1, j] = (HP[1, j] - root[1, 0] * HP[0, j]) / root[1, 1]
-    dx = HP.T @ y
-    for r in range(N):
-        for j in range(N):
-            P[r, j] -= HP[0, r] * HP[0, j] + HP[1, r] * HP[1, j]
-    turn_by(R, dx[:3])
-    x[3:] += dx[3:]
+@compiled_sums
+def _take_in(kept: Kept, m: int, own: Any, now: Any, dy: Any) -> None:
+    """Write the derivative of a whitened innovation, shape (2, q), and take it into that of the state."""
+    q, H, HP, L = own.shape[1], kept.H[m], kept.HP[m], kept.L[m]
+    for j in range(q):
+        dy[0, j] = own[0, j] / L[0, 0]
+        dy[1, j] = (own[1, j] - L[1, 0] * dy[0, j]) / L[1, 1]
+    for i in range(N):
+        a, b = H[i], H[N + i]
+        if a != 0.0 or b != 0.0:
+            for j in range(q):
+                dy[0, j] -= a * now[i * q + j]
+                dy[1, j] -= b * now[i * q + j]
+    for i in range(N):
+        a, b = HP[i], HP[N + i]
+        for j in range(q):
+            now[i * q + j] += a * dy[0, j] + b * dy[1, j]
 
 
 @compiled
@@ -52,7 +49,7 @@ def carry_forward(
     acc_var: Any,
     R: Any,
     x: Any,
-    P: Any,
+    P_start: Any,
     own: Any,
     of: Any,
     R_nodes: Any,
@@ -63,7 +60,7 @@ def carry_forward(
     y: Any,
     dy: Any,
 ) -> None:
-    """Run the filter from R, x and P, and write what the way back needs.
+    """Run the filter from R, x and P, shape (22, 22), and write what the way back needs.
 
     Parameters
     ----------
@@ -74,29 +71,53 @@ def carry_forward(
         The states that are wanted.
     R_nodes, rows, changed : ndarray, shape (K, 3, 3), (K, c, 22), (K, c, q)
         Written: attitude, rows of the covariance, and derivative of the states at each node.
-    H, HP, y, dy : ndarray, shape (m, 2, 22), (m, 2, 22), (m, 2), (m, 2, q)
+    H, HP, y, dy : ndarray, shape (m, 2 N), (m, 2 N), (m, 2), (m, 2, q)
         Written, whitened: of each LED; zero where it is not used.
     """
-    leds, q = run.leds, own.shape[2]
-    now, F, FP, root = np.zeros((N, q)), np.zeros((M, N)), np.zeros((M, N)), np.zeros((2, 2))
-    for k in range(len(run.has_frame)):
-        if k > 0 and run.dt_s[k - 1] > 0.0:
-            before = R.copy()
-            step_to(run, k, gyro_var[k - 1], acc_var[k - 1], R, x, P, F, FP)
-            now[:M] = F @ now
-            drive(run, k - 1, before, now)
-        for i in range(leds.first[k, 0], leds.first[k + 1, 0]):
-            if not leds.use[i]:
-                H[i], HP[i], y[i], dy[i] = 0.0, 0.0, 0.0, 0.0
-                continue
-            _take_in(run, i, R, x, P, H[i], HP[i], y[i], root)
-            dy[i, 0] = own[i, 0] / root[0, 0]
-            dy[i, 1] = (own[i, 1] - root[1, 0] * dy[i, 0]) / root[1, 1]
-            dy[i] -= H[i] @ now
-            now += HP[i].T @ dy[i]
-        R_nodes[k] = R
-        for c in range(len(of)):
-            rows[k, c], changed[k, c] = P[of[c]], now[of[c]]
+    leds, n_nodes, q, P = run.leds, len(run.has_frame), own.shape[2], P_start.ravel()
+    nis, inflation, room = np.empty(n_nodes), np.empty(n_nodes), room_to_work()
+    now, F_flat = np.zeros(N * q), np.zeros(F_SIZE)
+    F, now_rows = F_flat.reshape((M, N)), now.reshape((N, q))
+    for start in range(0, n_nodes, CHUNK):
+        stop = min(start + CHUNK, n_nodes)
+        kept = room_for(stop - start, measurements_of(run, start, stop))
+        forward_stretch(run, gyro_var, acc_var, start, stop, R, x, P, nis, inflation, room, kept)
+        for k in range(start, stop):
+            if k > 0 and run.dt_s[k - 1] > 0.0:
+                transition(run, k - 1, R_nodes[k - 1], F)
+                step_forward(F_flat, now, run.dt_s[k - 1], q)
+                drive(run, k - 1, R_nodes[k - 1], now_rows)
+            m = kept.first[k - start]
+            for i in range(leds.first[k, 0], leds.first[k + 1, 0]):
+                if leds.use[i]:
+                    H[i], HP[i], y[i] = kept.H[m, : 2 * N], kept.HP[m, : 2 * N], kept.y[m, :2]
+                    _take_in(kept, m, own[i], now, dy[i])
+                    m += 1
+                else:
+                    H[i], HP[i], y[i], dy[i] = 0.0, 0.0, 0.0, 0.0
+            R_nodes[k] = kept.R[k - start]
+            for c in range(len(of)):
+                rows[k, c] = kept.P[k - start, of[c] * N : (of[c] + 1) * N]
+                changed[k, c] = now_rows[of[c]]
+
+
+@compiled_sums
+def _take_back(H: Any, HP: Any, dy: Any, later: Any, work: Any) -> None:
+    """Carry what comes later, flat, to before an LED, in place; ``work``, shape (2, q), is to work in."""
+    q = dy.shape[1]
+    for r in range(2):
+        for j in range(q):
+            work[r, j] = dy[r, j]
+    for i in range(N):
+        a, b = HP[i], HP[N + i]
+        for j in range(q):
+            work[0, j] -= a * later[i * q + j]
+            work[1, j] -= b * later[i * q + j]
+    for i in range(N):
+        a, b = H[i], H[N + i]
+        if a != 0.0 or b != 0.0:
+            for j in range(q):
+                later[i * q + j] += a * work[0, j] + b * work[1, j]
 
 
 @compiled
@@ -105,15 +126,14 @@ def carry_back(run: RunArrays, R_nodes: Any, H: Any, HP: Any, dy: Any, rows: Any
 
     The adjoint of the way forwards (modified Bryson-Frazier form); see `carry_forward`.
     """
-    leds = run.leds
-    later, F = np.zeros((N, changed.shape[2])), np.zeros((M, N))
+    leds, q = run.leds, changed.shape[2]
+    later, work, F_flat = np.zeros(N * q), np.empty((2, q)), np.zeros(F_SIZE)
+    F, later_rows = F_flat.reshape((M, N)), later.reshape((N, q))
     for k in range(len(run.has_frame) - 1, -1, -1):
-        changed[k] += rows[k] @ later
+        changed[k] += rows[k] @ later_rows
         for i in range(leds.first[k + 1, 0] - 1, leds.first[k, 0] - 1, -1):
             if leds.use[i]:
-                later += H[i].T @ (dy[i] - HP[i] @ later)
+                _take_back(H[i], HP[i], dy[i], later, work)
         if k > 0 and run.dt_s[k - 1] > 0.0:
             transition(run, k - 1, R_nodes[k - 1], F)
-            before = F.T @ later[:M]
-            before[M:] += later[M:]
-            later = before
+            step_back(F_flat, later, run.dt_s[k - 1], q)

@@ -19,7 +19,7 @@ from bricktrack_host.fusion.cross_check import CrossCheck, cross_check
 from bricktrack_host.fusion.estimate import FusionInput, FusionResult, fused_result, prepare_run
 from bricktrack_host.fusion.fused_output import sample_motion
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_signal import seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
 from bricktrack_host.fusion.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_smoothing import smooth_leds
 from bricktrack_host.fusion.pose_level import smooth_poses

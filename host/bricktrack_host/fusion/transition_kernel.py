@@ -6,7 +6,7 @@ The equations are DESIGN 8.2's, the layout of the 22 states is `smoother`'s.
 from typing import Any, NamedTuple
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.compiled import compiled, compiled_sums
+from bricktrack_host.compiled import compiled_sums
 from bricktrack_host.fusion.covariance_kernel import propagate
 from bricktrack_host.fusion.observation_kernel import LedArrays
 from bricktrack_host.fusion.rotation_kernel import orthonormalise
@@ -128,11 +128,3 @@ def move_to(
     transition(run, j, R, F)
     _move(run, j, R, x, F)
     propagate(F_flat, P, room, run.dt_s[j], gyro_var, acc_var, run.gyro_walk[j], run.acc_walk[j])
-
-
-@compiled
-def step_to(
-    run: RunArrays, k: int, gyro_var: float, acc_var: float, R: Any, x: Any, P: Any, F: Any, room: Any
-) -> None:
-    """Do the same as `move_to` for P, F and ``room`` of shape (22, 22), (9, 22) and (9, 22)."""
-    move_to(run, k, gyro_var, acc_var, R, x, P.ravel(), F, F.ravel(), room.ravel())

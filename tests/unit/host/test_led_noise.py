@@ -65,3 +65,11 @@ def test_steps_of_inertial_noise_are_factors_of_two_and_few_impacts_are_believed
     assert told.acc_impact_share == pytest.approx(0.25 * np.sqrt(1.5))
     assert told.gyro_impact_share == pytest.approx(0.075 * np.sqrt(1.5))
     assert InertialNoise().settings(stated) == stated
+
+
+def test_an_led_that_nothing_can_be_said_of_does_not_count():
+    rng = np.random.default_rng(3)
+    chi2, still, use = chi2_of(1.5, 4000, rng), np.zeros(4000, dtype=bool), np.ones(4000, dtype=bool)
+    without = centroid_scales(chi2[100:], still[100:], use[100:], STATED_SCALES)
+    chi2[:100] = np.nan
+    assert np.array_equal(centroid_scales(chi2, still, use, STATED_SCALES), without)

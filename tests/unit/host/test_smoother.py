@@ -254,3 +254,19 @@ def test_a_frame_far_off_is_believed_less_but_pulls_a_lost_filter_back():
     shifted[30:] += 0.05
     back = Filter(replace(problem, p_seen_m=shifted, acc_var=looser)).smooth().state.x[38, 0, POS]
     assert np.abs(back - shifted[38, 0]).max() < 0.005
+
+
+def test_a_variance_of_which_rounding_leaves_nothing_is_nan_and_one_that_was_never_there_is_zero():
+    # The variance is that at the start less what the frames took of it: of 1e12 m^2 a double keeps 1e-4 m^2, and
+    # some 1e-9 m^2 are left in truth. Half of what rounding leaves is less than nothing.
+    problem = straight_problem(11)
+    P = problem.P_start.copy()
+    P[0, LAG] = P[0, :, LAG] = 0.0
+    P[0, ATT, ATT] = np.eye(3) * 1e-2
+    P[0, POS, POS], P[0, VEL, VEL] = np.eye(3) * 1e12, np.eye(3) * 1e12
+    e = Filter(replace(problem, P_start=P)).smooth(of=ALL)
+    variance = np.diagonal(e.covariance[:, 0], axis1=1, axis2=2)
+    assert not (np.delete(variance, LAG, axis=1) <= 0).any()
+    assert np.isnan(variance[:, POS]).any()
+    assert (variance[:, LAG] == 0).all()
+    assert np.array_equal(variance, e.variance[:, 0], equal_nan=True)

@@ -8,7 +8,7 @@ from daemon_runs import simulate_run
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.led_measurements import SeenLeds
-from bricktrack_host.fusion.observation_kernel import LedArrays, observe_led
+from bricktrack_host.fusion.observation_kernel import LedArrays, observation_room, place_led
 from bricktrack_host.fusion.smoother import ATT, N_STATES, POS, VEL
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.tracking.optical_track import solve_poses
@@ -133,15 +133,15 @@ def test_led_jacobian_is_the_derivative():
     arm = np.array([0.026, 0.053, 0.014])
     x = np.zeros(N_STATES)
     x[POS], x[VEL] = leds.t_lin_m[0] + [0.02, 0.05, 0.01], [0.1, -0.3, 0.2]
-    R = leds.R_lin[0] @ step.T
+    R, room = leds.R_lin[0] @ step.T, observation_room()
 
     def seen(d):
         moved = x + d
         moved[ATT] = 0
-        H, y = np.zeros((2, N_STATES)), np.zeros(2)
+        H, y = np.zeros(2 * N_STATES), np.zeros(2)
         turned = R @ Rotation.from_rotvec(d[ATT]).as_matrix()
-        observe_led(leds, 0, turned, moved, arm, np.zeros(3), np.zeros(5), 0.0, 0.0, H, y)
-        return y, H
+        place_led(leds, 0, turned, moved, arm, np.zeros(3), np.zeros(5), 0.0, 0.0, H, y, room)
+        return y, H.reshape(2, N_STATES)
 
     _, H = seen(np.zeros(N_STATES))
     for i in range(N_STATES):
