@@ -6,6 +6,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.gap_fill import fill_of_gaps
 from bricktrack_host.fusion.imu_samples import CleanSamples, clean_samples, seconds_since
 from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.inertial_noise import NoiseLevel as NoiseLevel
@@ -85,6 +86,8 @@ class Run:
     ) -> "Run":
         """Return what of a run is used: frames with a pose, and the time to be covered."""
         samples = clean_samples(imu)
+        if camera is None:
+            samples = replace(samples, fill=fill_of_gaps(optical, samples, alignment, lever_arm_mm * 1e-3))
         signal = ImuSignal.from_samples(samples, gyro_filter_s=alignment.gyro_filter_s)
         if camera is not None:
             optical = still_track(optical, camera, imu_seconds(alignment, optical.t_ns, signal.epoch_ns))

@@ -19,6 +19,8 @@ from bricktrack_host.fusion.vibration import mend_vibration
 from bricktrack_host.tracks import ImuTrack
 
 MIN_SAMPLES = 20
+BRIDGE_PERIODS = 3.5
+"""Up to here the cubic may bridge a gap; beyond, a fill or a straight line."""
 # sd of (sample - polynomial through eight neighbours) over sd of one sample, white noise
 _PREDICTION_GAIN = comb(16, 8) ** 0.5 / comb(8, 4)
 _STEADY_SAMPLES = 25
@@ -100,6 +102,40 @@ def bridge_error(values: FloatArray) -> FloatArray:
     return np.asarray(_usual(_off_neighbours(values, 2)).max(axis=1))
 
 
+def fill_instants(before_s: float, after_s: float, period_s: float) -> FloatArray:
+    """Return the even instants, a sample period or less apart, between the samples beside a gap."""
+    n_steps = int(np.ceil((after_s - before_s) / period_s))
+    return np.asarray(before_s + np.arange(1, n_steps) / n_steps * (after_s - before_s))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fill:
+    """What stands for the samples in long gaps, see `gap_fill`.
+
+    Attributes
+    ----------
+    t_s : ndarray, shape (m,)
+        Rising, all within the gaps.
+    gyro_radps, acc_mps2 : ndarray, shape (m, 3)
+    spans_s : ndarray, shape (n_gaps, 2)
+        From the last sample before to the first after each gap that is filled.
+    gyro_density, acc_density : float, rad^2/s and m^2/s^3
+        Of their error as white noise.
+    """
+
+    t_s: FloatArray
+    gyro_radps: FloatArray
+    acc_mps2: FloatArray
+    spans_s: FloatArray
+    gyro_density: float
+    acc_density: float
+
+    def covers(self, t_s: FloatArray) -> BoolArray:
+        """Return which instants lie in a gap that is filled."""
+        i = np.searchsorted(self.spans_s[:, 0], t_s, side="left") - 1
+        return np.asarray((i >= 0) & (t_s < self.spans_s[np.maximum(i, 0), 1]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanSamples:
     """The samples of a run that can be used, with clipped peaks and broken vibrations mended.
@@ -115,6 +151,8 @@ class CleanSamples:
         Above zero where a sample was clipped or stands beside one.
     filled_sd_mps2 : ndarray, shape (n,)
         Above zero where samples that broke a vibration were filled.
+    fill : Fill or None
+        What stands for those missing in long gaps.
     """
 
     epoch_ns: int
@@ -123,12 +161,20 @@ class CleanSamples:
     acc_mps2: FloatArray
     clip_sd_mps2: FloatArray
     filled_sd_mps2: FloatArray
+    fill: Fill | None = None
 
     def without_gains(self, gyro_gain: FloatArray, acc_gain: FloatArray) -> "CleanSamples":
         """Return the samples without the gains, shape (3, 3), that they have over the truth."""
-        gyro = np.asarray(np.linalg.solve(gyro_gain, self.gyro_radps.T).T, dtype=np.float64)
-        acc = np.asarray(np.linalg.solve(acc_gain, self.acc_mps2.T).T, dtype=np.float64)
-        return replace(self, gyro_radps=gyro, acc_mps2=acc)
+        fill = self.fill
+        if fill is not None:
+            gyro, acc = _without(gyro_gain, fill.gyro_radps), _without(acc_gain, fill.acc_mps2)
+            fill = replace(fill, gyro_radps=gyro, acc_mps2=acc)
+        gyro, acc = _without(gyro_gain, self.gyro_radps), _without(acc_gain, self.acc_mps2)
+        return replace(self, gyro_radps=gyro, acc_mps2=acc, fill=fill)
+
+
+def _without(gain: FloatArray, values: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.solve(gain, values.T).T, dtype=np.float64)
 
 
 def clean_samples(imu: ImuTrack) -> CleanSamples:

@@ -11,14 +11,20 @@ from scipy.interpolate import CubicSpline, PPoly
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_host.compiled import compiled
-from bricktrack_host.fusion.imu_samples import CleanSamples, bridge_error, clean_samples, roughness
+from bricktrack_host.fusion.imu_samples import (
+    BRIDGE_PERIODS,
+    CleanSamples,
+    bridge_error,
+    clean_samples,
+    fill_instants,
+    roughness,
+)
 from bricktrack_host.fusion.imu_samples import seconds_since as seconds_since
 from bricktrack_host.fusion.imu_samples import usable_samples as usable_samples
 from bricktrack_host.fusion.signal_kernel import SignalPieces, integrate_steps
 from bricktrack_host.tracks import ImuTrack
 
 _GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
-_BRIDGE_PERIODS = 3.5  # up to here the cubic may bridge it; beyond, a straight line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,15 +77,24 @@ def sharpened(t_s: FloatArray, values: FloatArray, filter_s: float) -> FloatArra
     return np.asarray(values - filter_s**2 * second + 2 / 3 * filter_s**3 * third)
 
 
-def _spline(t_s: FloatArray, values: FloatArray, period_s: float) -> CubicSpline[Any]:
-    """Return the cubic through samples; points on the chord keep it from swinging across a long gap."""
-    interval = np.diff(t_s)
+def _spline(
+    t_s: FloatArray, values: FloatArray, period_s: float, fill: tuple[FloatArray, FloatArray] | None
+) -> CubicSpline[Any]:
+    """Return the cubic through samples and the fill's instants and values, shape (m,) and (m, 3).
+
+    In a long gap without a fill, points on the chord keep it from swinging across.
+    """
     knots, at_knots = t_s, values
-    for i in np.flatnonzero(interval > _BRIDGE_PERIODS * period_s)[::-1]:
-        n_fill = int(np.ceil(interval[i] / period_s)) - 1
-        share = np.arange(1, n_fill + 1)[:, None] / (n_fill + 1)
-        knots = np.insert(knots, i + 1, t_s[i] + share[:, 0] * interval[i])
-        at_knots = np.insert(at_knots, i + 1, values[i] + share * (values[i + 1] - values[i]), axis=0)
+    for i in np.flatnonzero(np.diff(t_s) > BRIDGE_PERIODS * period_s)[::-1]:
+        between, at = fill_instants(t_s[i], t_s[i + 1], period_s), None
+        if fill is not None:
+            inside = (fill[0] > t_s[i]) & (fill[0] < t_s[i + 1])
+            between, at = (fill[0][inside], fill[1][inside]) if inside.any() else (between, None)
+        if at is None:
+            share = (between[:, None] - t_s[i]) / (t_s[i + 1] - t_s[i])
+            at = values[i] + share * (values[i + 1] - values[i])
+        knots = np.insert(knots, i + 1, between)
+        at_knots = np.insert(at_knots, i + 1, at, axis=0)
     return CubicSpline(knots, at_knots)
 
 
@@ -151,7 +166,9 @@ class ImuSignal:
             gyro = sharpened(t_s, gyro, gyro_filter_s)
             gyro_impact = roughness(gyro)[1]
         missing = np.flatnonzero(interval > _GAP_PERIODS * period_s)
-        gyro_spline, acc_spline = _spline(t_s, gyro, period_s), _spline(t_s, acc, period_s)
+        fill = samples.fill
+        gyro_spline = _spline(t_s, gyro, period_s, None if fill is None else (fill.t_s, fill.gyro_radps))
+        acc_spline = _spline(t_s, acc, period_s, None if fill is None else (fill.t_s, fill.acc_mps2))
         signal = cls(
             samples=samples,
             period_s=period_s,
@@ -176,7 +193,8 @@ class ImuSignal:
         """Return the signals with this low-pass of the accelerometer undone, in place of any other."""
         samples = self.samples
         acc = sharpened(samples.t_s, samples.acc_mps2, acc_filter_s)
-        spline = _spline(samples.t_s, acc, self.period_s)
+        fill = samples.fill
+        spline = _spline(samples.t_s, acc, self.period_s, None if fill is None else (fill.t_s, fill.acc_mps2))
         return replace(
             self,
             acc_mps2=acc,

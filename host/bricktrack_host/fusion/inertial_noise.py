@@ -21,8 +21,8 @@ class NoiseParts:
     Attributes
     ----------
     gyro_fixed, acc_fixed
-        White noise of the samples, impacts, clipping, a sample bridged, and gaps, where the whole spread of
-        the signal is the error.
+        White noise of the samples, impacts, clipping, a sample bridged, and gaps: what their fill is off by,
+        or without one the whole spread of the signal.
     gyro_rough, acc_rough
         Steady roughness beyond the sensor's own noise, at a share of 1.
     gyro_systematic, acc_systematic
@@ -80,7 +80,11 @@ def noise_parts(
     def at(values: FloatArray, shift_s: float) -> FloatArray:
         return np.asarray(np.interp(points + shift_s, signal.t_s, values).mean(axis=0))
 
-    gap = hold * signal.in_gap(points, least_periods=_ONE_MISSING).mean(axis=0)
+    lost = signal.in_gap(points, least_periods=_ONE_MISSING)
+    fill = signal.samples.fill
+    filled = np.zeros(lost.shape, dtype=np.bool_) if fill is None else fill.covers(points)
+    gap = hold * (lost & ~filled).mean(axis=0)
+    fill_gyro, fill_acc = (0.0, 0.0) if fill is None else (fill.gyro_density, fill.acc_density)
     bridged = period * signal.in_gap(points).mean(axis=0)
     gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
     shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
@@ -91,12 +95,14 @@ def noise_parts(
     return NoiseParts(
         gyro_fixed=at(gyro_fixed * period, 0.0)
         + bridged * at(signal.gyro_bridge_radps, 0.0) ** 2
-        + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2,
+        + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2
+        + filled.mean(axis=0) * fill_gyro,
         gyro_rough=at(gyro_rough * period, 0.0),
         gyro_systematic=at((s.gyro_scale_sd * size) ** 2 * hold, 0.0),
         acc_fixed=at(acc_fixed * period, lin.lag_s)
         + bridged * at(signal.acc_bridge_mps2, lin.lag_s) ** 2
-        + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2,
+        + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2
+        + filled.mean(axis=0) * fill_acc,
         acc_rough=at(acc_rough * period, lin.lag_s),
         acc_systematic=at(acc_systematic * hold, lin.lag_s),
     )

@@ -28,9 +28,10 @@ _INNOVATION_GATE = 63.0  # five times the 95 % point of chi-square with 6: real 
 _NIS_CAP = 200.0  # so that an outlier does not choose the jerk
 _JERK_WINDOW_S = 0.5
 _VELOCITY = np.arange(9, 12)  # of the position, among the states
-# Densities of white jerk tried, rad^2/s^5 and mm^2/s^5: from a brick at rest to 50 mm at 10 Hz.
-_ROTATION_JERK = 10.0 ** np.arange(-4.0, 8.5, 1.0)
-_POSITION_JERK = 10.0 ** np.arange(-1.0, 11.5, 1.0)
+# Densities of white jerk tried, rad^2/s^5 and mm^2/s^5: from a brick at rest to 50 mm at 10 Hz, and beyond,
+# more coarsely, to one that is put elsewhere from one frame to the next: there every frame stands for itself.
+_ROTATION_JERK = 10.0 ** np.concatenate([np.arange(-4.0, 8.5, 1.0), [10.0, 12.0]])
+_POSITION_JERK = 10.0 ** np.concatenate([np.arange(-1.0, 11.5, 1.0), [13.0, 15.0]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +110,13 @@ class _Smoother:
                 S = P[:, :6, :6] + R
                 nis = (y * np.linalg.solve(S, y[..., None])[..., 0]).sum(axis=1)
                 self.log_likelihood[k] = -0.5 * (np.linalg.slogdet(S)[1] + np.minimum(nis, _NIS_CAP))
-                S = P[:, :6, :6] + R * np.maximum(nis / _INNOVATION_GATE, 1.0)[:, None, None]
+                R_used = R * np.maximum(nis / _INNOVATION_GATE, 1.0)[:, None, None]
+                S = P[:, :6, :6] + R_used
                 gain = np.swapaxes(np.linalg.solve(S, P[:, :6]), 1, 2)
                 x = x + (gain @ y[..., None])[..., 0]
-                P = P - gain @ P[:, :6]
+                # Joseph's form: what a sharp frame leaves of a wide prediction is no difference of the two.
+                rest = np.eye(18) - np.pad(gain, ((0, 0), (0, 0), (0, 12)))
+                P = rest @ P @ np.swapaxes(rest, 1, 2) + gain @ R_used @ np.swapaxes(gain, 1, 2)
                 P = 0.5 * (P + np.swapaxes(P, 1, 2))
             self.x[k], self.P[k] = x, P
 
@@ -145,8 +149,9 @@ def _choose_jerk(t_s: FloatArray, z: FloatArray, cov: FloatArray, kick_mmps: Flo
         return np.asarray(densities[np.argmax(local, axis=1)])
 
     ones = np.ones((len(t_s), 1, 3))
-    turn = np.full(len(t_s), _ROTATION_JERK[len(_ROTATION_JERK) // 2])
-    shift = np.full(len(t_s), _POSITION_JERK[len(_POSITION_JERK) // 2])
+    # Begun with a position that may do anything: what it leaves of a frame says nothing of the turn,
+    # and sharp frames would all count as outliers, whatever the turn.
+    shift = np.full(len(t_s), _POSITION_JERK[-1])
     for _ in range(2):
         q = _ROTATION_JERK[:, None] * ones
         turn = best(np.concatenate([q, shift[:, None, None] * np.ones_like(q)], axis=2), _ROTATION_JERK)
