@@ -76,6 +76,7 @@ class TimePanels:
         """Return an empty panel."""
         new = styled_panel(y_label, title=title, height_px=height_px, x_range=self._range)
         new.name = "over time"
+        new.window_axis = "x"  # what is beside the time shown does not flatten the curves
         new.add_tools(CrosshairTool(overlay=self._pointer))
         if len(self._events.dropouts_s):
             first, last = self._events.dropouts_s.T

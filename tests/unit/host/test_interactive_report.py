@@ -117,6 +117,8 @@ def test_dropouts_and_impacts_are_marked_in_every_panel_over_time(html, result):
     assert len(panels) == 6 + 6 + 2 + 3 + 3
     strips = [r for r in found["GlyphRenderer"] if r.get("name") == "dropouts"]
     assert len(strips) == len(panels)
+    # An impact after the video would flatten the curves of the time that is shown.
+    assert {p["window_axis"] for p in panels} == {"x"}
     shaded = [s for s in sources(html) if set(s) == {"x0", "x1"}]
     assert len(shaded) == len(panels)
     expected_s = (figures.dropouts_ns - result.t0_ns) / 1e9
