@@ -1,5 +1,7 @@
 """Where a vector or matrix is a number throughout: NaN means "not measured" all over the host."""
 
+import math
+
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
@@ -13,5 +15,11 @@ def all_finite(values: FloatArray, n_axes: int = 1) -> BoolArray:
     >>> all_finite(np.array([[1.0, 2.0], [np.nan, 3.0]])).tolist()
     [True, False]
     """
-    axes = tuple(range(-n_axes, 0))
-    return np.asarray(np.isfinite(values).all(axis=axes), dtype=np.bool_)
+    lead = values.shape[: values.ndim - n_axes]
+    finite = np.isfinite(values).reshape(*lead, math.prod(values.shape[values.ndim - n_axes :]))
+    if finite.shape[-1] > 16:
+        return np.asarray(finite.all(axis=-1), dtype=np.bool_)
+    out = np.ones(lead, dtype=np.bool_)
+    for k in range(finite.shape[-1]):  # numpy sums along short axes ten times slower than across them
+        out &= finite[..., k]
+    return out

@@ -15,7 +15,7 @@ from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_profile import collar_of
 from bricktrack_host.tracking.p3p import ray_centre_mm, rays_of, solve_p3p
-from bricktrack_host.tracking.prsoi import ROUGH_MM, PrsoiForm, prsoi_starts
+from bricktrack_host.tracking.prsoi import START_MM, PrsoiForm, prsoi_starts
 from bricktrack_host.tracking.refine import MIN_LEDS, RefinedPoses, refine_poses
 
 _DOUBT_CHI2_PER_DOF = 9.0
@@ -68,7 +68,7 @@ def first_poses(
     form : "safe" or "printed"
         Of PRSOI, see there.
     """
-    R, t = prsoi_starts(uv_px, ray_model, brick_model, form, tolerance_mm=ROUGH_MM)
+    R, t = prsoi_starts(uv_px, ray_model, brick_model, form, tolerance_mm=START_MM)
     poses = refine_poses(uv_px, cov_px2, R, t, ray_model, brick_model, collar_mm=collar_of(brick_model))
     poses, ambiguous = _other_starts(uv_px, cov_px2, poses, t_ns, ray_model, brick_model)
     return FirstPoses(uv_px, poses.R_camera_brick, poses.t_camera_brick_mm, ambiguous)
@@ -103,19 +103,17 @@ def _other_starts(
         return poses, ambiguous
     R_try, t_try, chi2 = _poses_from_three(uv[frames], cov[frames], poses, frames, ray_model, brick_model)
     R_out, t_out = poses.R_camera_brick.copy(), poses.t_camera_brick_mm.copy()
-    for row, i in enumerate(frames):
-        own = poses.chi2[i] if np.isfinite(poses.chi2[i]) else np.inf
-        all_chi2 = np.append(chi2[row], own)
-        all_R = np.concatenate([R_try[row], R_out[i][None]])
-        all_t = np.concatenate([t_try[row], t_out[i][None]])
-        best = int(np.argmin(all_chi2))
-        if not np.isfinite(all_chi2[best]):
-            continue
-        R_out[i], t_out[i] = all_R[best], all_t[best]
-        close = np.isfinite(all_chi2) & (all_chi2 < all_chi2[best] + _RIVAL_CHI2)
-        turn = np.linalg.norm(rvec_from_matrix(all_R[best].T @ all_R[close]), axis=1)
-        if (turn > _SAME_POSE_RAD).any():
-            ambiguous[i] = True
+    own = np.where(np.isfinite(poses.chi2[frames]), poses.chi2[frames], np.inf)
+    all_chi2 = np.concatenate([chi2, own[:, None]], axis=1)
+    posed = np.flatnonzero(np.isfinite(all_chi2).any(axis=1))
+    all_chi2, i = all_chi2[posed], frames[posed]
+    all_R = np.concatenate([R_try[posed], R_out[i, None]], axis=1)
+    all_t = np.concatenate([t_try[posed], t_out[i, None]], axis=1)
+    best = np.arange(len(posed)), np.argmin(all_chi2, axis=1)
+    R_out[i], t_out[i] = all_R[best], all_t[best]
+    row, rival = np.nonzero(all_chi2 < all_chi2[best][:, None] + _RIVAL_CHI2)
+    turn = rvec_from_matrix(np.swapaxes(R_out[i[row]], -1, -2) @ all_R[row, rival])
+    ambiguous[i[row[np.linalg.norm(turn, axis=1) > _SAME_POSE_RAD]]] = True
     _believe_neighbours(ambiguous, R_out, t_out, R_try, t_try, chi2, frames, t_ns)
     R_out[ambiguous] = np.nan
     collar_mm = collar_of(brick_model)
@@ -135,7 +133,8 @@ def _poses_from_three(
     Chi-square, shape (m, 4), is infinite where there is no such pose, or it would hide an LED that is seen.
     """
     seen = all_finite(uv)
-    triple = np.array([_widest_triple(brick_model.led_positions_mm, s) for s in seen])
+    patterns, pattern_of = np.unique(seen, axis=0, return_inverse=True)
+    triple = np.array([_widest_triple(brick_model.led_positions_mm, s) for s in patterns])[pattern_of.ravel()]
     centre = ray_centre_mm(ray_model)
     points, _ = rays_of(ray_model, uv[np.arange(len(uv))[:, None], triple])
     bearing = points - centre

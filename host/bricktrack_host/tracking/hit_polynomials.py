@@ -17,7 +17,7 @@ from numpy.polynomial import polynomial
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.compiled import compiled, compiled_in_place
+from bricktrack_host.compiled import compiled, compiled_fast, compiled_in_place
 
 _ORDERS = (5, 7, 9, 11, 13, 15, 17)
 _REACH = 1.02  # scaled pixels: a centroid never lies farther outside than the rim of the last pixel
@@ -149,7 +149,7 @@ def expand_at(polynomials: HitPolynomials, uv_px: FloatArray) -> FloatArray:
     a, x and y on plane b. NaN where the pixel is.
     """
     uv = np.ascontiguousarray(uv_px.reshape(-1, 2))
-    out = np.empty((1, len(uv), 6, 4))
+    out = np.empty((len(uv), 6, 4))
     _expand_all(uv, polynomials.cells, polynomials.cell_px, out)
     return out.reshape(*uv_px.shape[:-1], 6, 4)
 
@@ -188,12 +188,12 @@ def _expand_all(uv: FloatArray, cells: FloatArray, cell_px: float, out: FloatArr
         expand_pixel(uv[k, 0], uv[k, 1], cells, cell_px, out, k)
 
 
-@compiled_in_place
+@compiled_fast
 def expand_pixel(u: float, v: float, cells: FloatArray, cell_px: float, hits: FloatArray, k: int) -> None:
-    """Fill in ``hits[0, k]``, (6, 4): hits at a pixel with their derivatives, see `expand_at`."""
+    """Fill in ``hits[k]``, (6, 4): hits at a pixel with their derivatives, see `expand_at`."""
     column, row = _cell_of(u, cell_px, cells.shape[1]), _cell_of(v, cell_px, cells.shape[0])
     d, e = u - (column + 0.5) * cell_px, v - (row + 0.5) * cell_px
-    C, out = cells[row, column], hits[0, k]
+    C, out = cells[row, column], hits[k]
     for c in range(4):
         c3, c4, c5, c6, c7, c8, c9 = C[3, c], C[4, c], C[5, c], C[6, c], C[7, c], C[8, c], C[9, c]
         by_d = C[1, c] + d * (c3 + d * c6)

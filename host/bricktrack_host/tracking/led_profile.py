@@ -17,13 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bricktrack_common.arrays import FloatArray, as_float_array
+from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
 from bricktrack_common.brick_model import DEFAULT_SHIFT_SD_PER_RADIUS, BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import skew
 from bricktrack_host.compiled import compiled
 from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
-from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view, outline
+from bricktrack_host.tracking.led_outline import outline, outlines_of
+from bricktrack_host.tracking.led_view import AREA, N_SHAPE, led_shape, led_view
 
 UNKNOWN_SHIFT_PER_RADIUS = 0.1
 """Standard deviation of the unknown shift, in LED radii times the sine of the view angle: between a bare
@@ -122,7 +123,10 @@ def predict_leds(
     centres = as_float_array("centres_camera_mm", centres_camera_mm, (..., 3))
     axes = as_float_array("axes_camera", axes_camera, (..., 3))
     lead = centres.shape[:-1]
-    radii = np.broadcast_to(np.asarray(radii_mm, dtype=np.float64), lead)
+    given_radii = np.asarray(radii_mm, dtype=np.float64)
+    radii = np.broadcast_to(given_radii, lead)
+    outlines = outlines_of(given_radii.ravel(), collar_mm)
+    kind = np.broadcast_to(outlines.kind.reshape(given_radii.shape), lead)
     uv = ray_model.project(centres).uv_px
     polynomials = hit_polynomials(ray_model)
     hits = expand_at(polynomials, uv)
@@ -132,8 +136,9 @@ def predict_leds(
         np.ascontiguousarray(centres.reshape(-1, 3)),
         np.ascontiguousarray(axes.reshape(-1, 3)),
         radii.reshape(-1),
-        np.nan if collar_mm is None else collar_mm,
-        hits.reshape(-1, 1, 6, 4),
+        outlines.tables,
+        kind.reshape(-1),
+        hits.reshape(-1, 6, 4),
         a,
         b - a,
     )
@@ -162,7 +167,8 @@ def _predict_all(
     centres: FloatArray,
     axes: FloatArray,
     radii: FloatArray,
-    collar: float,
+    tables: FloatArray,
+    kind: IntArray,
     hits: FloatArray,
     plane_a: float,
     apart: float,
@@ -170,14 +176,14 @@ def _predict_all(
     """Return centroid, area, facing and what is across the axis, (n, 6), and both Jacobians, (n, 2, 3)."""
     n = len(uv)
     out, J_centre, J_axis = np.empty((n, 6)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
-    shape = np.empty((1, N_SHAPE))
+    shape = np.empty((n, N_SHAPE))
     for i in range(n):
-        led_shape(centres[i], axes[i], radii[i], collar, hits, i, 0, plane_a, apart, shape)
+        led_shape(centres[i], axes[i], radii[i], tables, kind[i], hits, i, plane_a, apart, shape)
         du, dv, facing, magnification, shown_u, shown_v = led_view(
-            centres[i], axes[i], hits, i, 0, plane_a, apart, shape, J_centre[i], J_axis[i]
+            centres[i], axes[i], hits, i, plane_a, apart, shape, J_centre[i], J_axis[i]
         )
         out[i, 0], out[i, 1] = uv[i, 0] + du, uv[i, 1] + dv
-        out[i, 2], out[i, 3] = shape[0, AREA] * magnification, facing
+        out[i, 2], out[i, 3] = shape[i, AREA] * magnification, facing
         out[i, 4], out[i, 5] = shown_u, shown_v
     return out, J_centre, J_axis
 

@@ -1,14 +1,17 @@
 """Compiled: where one LED is seen, and how that moves with it, from the rays near a pixel.
 
 The neighbourhood of a pixel is its hits on two planes with their derivatives (`hit_polynomials`); the lit
-body's outline is that of `led_profile`. What is costly and hardly moves while a pose is refined (the
-outline's moments, the lens's curvature across the LED) is had once, as the LED's *shape*.
+body's outline is from the tables of `led_outline`. What is costly and hardly moves while a pose is refined
+(the outline's moments, the lens's curvature across the LED) is had once, as the LED's *shape*.
 """
 
 import math
 
+import numpy as np
+
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.compiled import compiled_in_place, compiled_inline
+from bricktrack_host.compiled import compiled_inline
+from bricktrack_host.tracking.led_outline import LARGEST_SIZE, LARGEST_TANGENT, outline_near
 
 (
     TANGENT,
@@ -29,47 +32,11 @@ N_SHAPE = 12
 along the projected axis over the angle's sine, mm (of a bare hemisphere it is linear in it); half length of
 the outline, mm; its area, mm^2; what the lens's curvature adds to the centroid, px; the centre that it is of,
 mm, and the slopes of the line of sight to there."""
-_TANGENT_STEP = 0.003
-_MAX_TANGENT = 3.0  # 143 degrees: nothing is seen of such an LED
-
-
-@compiled_in_place
-def outline(c: float, r: float, h: float, distance: float) -> tuple[float, float, float]:
-    """Return area, centroid and half length of an outline; see `led_profile.outline_moments`."""
-    s = math.sqrt(max(1 - c * c, 0.0))
-    rho = r / math.sqrt(1 - (r / distance) ** 2)
-    far = (-h * s + r * c) / (distance + h * c + r * s)
-    near = (-h * s - r * c) / (distance + h * c - r * s)
-    x_e, p = 0.5 * distance * (far + near), 0.5 * distance * abs(far - near)
-    k = r * s / (distance + h * c)
-    q = r * distance / ((distance + h * c) * math.sqrt(1 - k * k))
-    # Common tangent: (rho - x_e x)^2 = q^2 + (p^2 - q^2) x^2 with x the cosine of its normal's angle.
-    root = math.sqrt(max(rho**2 * x_e**2 - (x_e**2 + q**2 - p**2) * (rho**2 - q**2), 0.0))
-    x = min(max((rho**2 - q**2) / min(rho * x_e - root, -1e-12), -1.0), 1.0)
-    phi = math.acos(x)
-    sin_phi = math.sqrt(max(1 - x * x, 0.0))
-    theta = math.atan2(q * sin_phi, p * x)
-    size = math.hypot(q * sin_phi, p * x)
-    sin_t, cos_t = (q * sin_phi / size, p * x / size) if size > 0 else (0.0, 1.0)
-    cos2 = 0.5 * (math.pi - theta) - 0.5 * sin_t * cos_t  # integral of cos^2 from theta to pi
-    cos3 = -(sin_t - sin_t**3 / 3)
-    x1, y1 = rho * x, rho * sin_phi
-    x2, y2 = x_e + p * cos_t, q * sin_t
-    half_area = (
-        0.5 * rho**2 * (phi + sin_phi * x) + 0.5 * (x1 + x2) * (y2 - y1) + q * (-x_e * sin_t + p * cos2)
-    )
-    half_moment = (
-        0.5 * rho**3 * (sin_phi - sin_phi**3 / 3)
-        + (x1 * x1 + x1 * x2 + x2 * x2) * (y2 - y1) / 6
-        + 0.5 * q * (-(x_e**2) * sin_t + 2 * x_e * p * cos2 + p**2 * cos3)
-    )
-    rear = min(x_e - p, -rho if x <= -1 + 1e-12 else 0.0)
-    return 2 * half_area, half_moment / half_area, 0.5 * (rho - rear)
 
 
 @compiled_inline
 def pixel_near(
-    x: float, y: float, b: float, hits: FloatArray, i: int, k: int
+    x: float, y: float, b: float, hits: FloatArray, k: int
 ) -> tuple[float, float, float, float, float, float, float, float]:
     """Return where a point falls, from the rays near a pixel.
 
@@ -78,8 +45,8 @@ def pixel_near(
     x, y : float, mm
     b : float
         Depth of the point: 0 on plane a, 1 on plane b.
-    hits : ndarray, shape (n, n_leds, 6, 4)
-        Of which those of LED ``k`` in frame ``i`` are taken.
+    hits : ndarray, shape (n_leds, 6, 4)
+        Of which those of LED ``k`` are taken.
 
     Returns
     -------
@@ -90,20 +57,20 @@ def pixel_near(
         Slopes of its ray, over the distance of the planes.
     """
     a = 1 - b
-    ex, ey = x - a * hits[i, k, 0, 0] - b * hits[i, k, 0, 2], y - a * hits[i, k, 0, 1] - b * hits[i, k, 0, 3]
-    m00, m01 = a * hits[i, k, 1, 0] + b * hits[i, k, 1, 2], a * hits[i, k, 2, 0] + b * hits[i, k, 2, 2]
-    m10, m11 = a * hits[i, k, 1, 1] + b * hits[i, k, 1, 3], a * hits[i, k, 2, 1] + b * hits[i, k, 2, 3]
+    ex, ey = x - a * hits[k, 0, 0] - b * hits[k, 0, 2], y - a * hits[k, 0, 1] - b * hits[k, 0, 3]
+    m00, m01 = a * hits[k, 1, 0] + b * hits[k, 1, 2], a * hits[k, 2, 0] + b * hits[k, 2, 2]
+    m10, m11 = a * hits[k, 1, 1] + b * hits[k, 1, 3], a * hits[k, 2, 1] + b * hits[k, 2, 3]
     det = m00 * m11 - m01 * m10
     i00, i01, i10, i11 = m11 / det, -m01 / det, -m10 / det, m00 / det
     xuu, xuv, xvv = (
-        a * hits[i, k, 3, 0] + b * hits[i, k, 3, 2],
-        a * hits[i, k, 4, 0] + b * hits[i, k, 4, 2],
-        a * hits[i, k, 5, 0] + b * hits[i, k, 5, 2],
+        a * hits[k, 3, 0] + b * hits[k, 3, 2],
+        a * hits[k, 4, 0] + b * hits[k, 4, 2],
+        a * hits[k, 5, 0] + b * hits[k, 5, 2],
     )
     yuu, yuv, yvv = (
-        a * hits[i, k, 3, 1] + b * hits[i, k, 3, 3],
-        a * hits[i, k, 4, 1] + b * hits[i, k, 4, 3],
-        a * hits[i, k, 5, 1] + b * hits[i, k, 5, 3],
+        a * hits[k, 3, 1] + b * hits[k, 3, 3],
+        a * hits[k, 4, 1] + b * hits[k, 4, 3],
+        a * hits[k, 5, 1] + b * hits[k, 5, 3],
     )
     du, dv = i00 * ex + i01 * ey, i10 * ex + i11 * ey
     for _ in range(2):  # the quadratic part: 1e-4 px at 1 px from the pixel, 0.1 px at 30
@@ -114,36 +81,36 @@ def pixel_near(
     m10, m11 = m10 + yuu * du + yuv * dv, m11 + yuv * du + yvv * dv
     det = m00 * m11 - m01 * m10
     kx = (
-        hits[i, k, 0, 2]
-        - hits[i, k, 0, 0]
-        + (hits[i, k, 1, 2] - hits[i, k, 1, 0]) * du
-        + (hits[i, k, 2, 2] - hits[i, k, 2, 0]) * dv
+        hits[k, 0, 2]
+        - hits[k, 0, 0]
+        + (hits[k, 1, 2] - hits[k, 1, 0]) * du
+        + (hits[k, 2, 2] - hits[k, 2, 0]) * dv
     )
     ky = (
-        hits[i, k, 0, 3]
-        - hits[i, k, 0, 1]
-        + (hits[i, k, 1, 3] - hits[i, k, 1, 1]) * du
-        + (hits[i, k, 2, 3] - hits[i, k, 2, 1]) * dv
+        hits[k, 0, 3]
+        - hits[k, 0, 1]
+        + (hits[k, 1, 3] - hits[k, 1, 1]) * du
+        + (hits[k, 2, 3] - hits[k, 2, 1]) * dv
     )
     return du, dv, m11 / det, -m01 / det, -m10 / det, m00 / det, kx, ky
 
 
-@compiled_in_place
+@compiled_inline
 def led_shape(
     centre: FloatArray,
     axis: FloatArray,
     radius: float,
-    collar: float,
+    tables: FloatArray,
+    kind: int,
     hits: FloatArray,
-    i: int,
     k: int,
     plane_a: float,
     apart: float,
     shape: FloatArray,
 ) -> None:
-    """Fill in the shape of LED ``k`` in frame ``i``, see `N_SHAPE`; no fitted ``collar`` is NaN."""
+    """Fill in the shape of LED ``k``, whose outline is in ``tables[kind]``; see `N_SHAPE`."""
     share = (centre[2] - plane_a) / apart
-    _, _, i00, i01, i10, i11, kx, ky = pixel_near(centre[0], centre[1], share, hits, i, k)
+    _, _, i00, i01, i10, i11, kx, ky = pixel_near(centre[0], centre[1], share, hits, k)
     kx, ky = kx / apart, ky / apart
     norm = math.sqrt(kx * kx + ky * ky + 1)
     dx, dy, dz = kx / norm, ky / norm, 1 / norm
@@ -151,20 +118,15 @@ def led_shape(
     distance = centre[2] / dz
     ax, ay, az = axis[0] - along * dx, axis[1] - along * dy, axis[2] - along * dz
     s = math.sqrt(ax * ax + ay * ay + az * az)
-    if math.isnan(collar):  # the sphere's own outline
-        half = radius / math.sqrt(1 - (radius / distance) ** 2)
-        shape[k, TANGENT], shape[k, SHIFT], shape[k, SHIFT_1] = 0.0, 0.0, 0.0
-        shape[k, HALF_LENGTH], shape[k, AREA] = half, math.pi * half**2
-    else:
-        at = min(max(s / (1 - along), 1.5 * _TANGENT_STEP), _MAX_TANGENT)
-        low, high = at - _TANGENT_STEP, at + _TANGENT_STEP
-        per_low, per_high = 1 / (1 + low * low), 1 / (1 + high * high)
-        area_low, shift_low, half_low = outline((1 - low * low) * per_low, radius, collar, distance)
-        area_high, shift_high, half_high = outline((1 - high * high) * per_high, radius, collar, distance)
-        shift_low, shift_high = shift_low / (2 * low * per_low), shift_high / (2 * high * per_high)
-        shape[k, TANGENT], shape[k, SHIFT] = at, 0.5 * (shift_low + shift_high)
-        shape[k, SHIFT_1] = (shift_high - shift_low) / (2 * _TANGENT_STEP)
-        shape[k, HALF_LENGTH], shape[k, AREA] = 0.5 * (half_low + half_high), 0.5 * (area_low + area_high)
+    size = radius / distance
+    at = min(s / max(1 - along, 1e-3), LARGEST_TANGENT)
+    if 0 <= size <= LARGEST_SIZE and 0 <= at <= LARGEST_TANGENT:
+        shift, slope, half, area = outline_near(tables, kind, at, size)
+        shape[k, TANGENT], shape[k, SHIFT], shape[k, SHIFT_1] = at, shift * radius, slope * radius
+        shape[k, HALF_LENGTH], shape[k, AREA] = half * radius, area * radius * radius
+    else:  # behind the camera or inside its lens
+        shape[k, TANGENT], shape[k, SHIFT], shape[k, SHIFT_1] = np.nan, np.nan, np.nan
+        shape[k, HALF_LENGTH], shape[k, AREA] = np.nan, np.nan
     shape[k, AT_X], shape[k, AT_Y], shape[k, AT_Z] = centre[0], centre[1], centre[2]
     shape[k, SLOPE_X], shape[k, SLOPE_Y] = kx, ky
     # Unit vectors across the line of sight, the first along the projected axis.
@@ -177,9 +139,9 @@ def led_shape(
     # How they show in the picture, to first and second order.
     a0, a1 = i00 * (e1x - kx * e1z) + i01 * (e1y - ky * e1z), i10 * (e1x - kx * e1z) + i11 * (e1y - ky * e1z)
     b0, b1 = i00 * (e2x - kx * e2z) + i01 * (e2y - ky * e2z), i10 * (e2x - kx * e2z) + i11 * (e2y - ky * e2z)
-    aa0, aa1 = _bend(a0, a1, e1z, a0, a1, e1z, share, apart, hits, i, k, i00, i01, i10, i11)
-    ab0, ab1 = _bend(a0, a1, e1z, b0, b1, e2z, share, apart, hits, i, k, i00, i01, i10, i11)
-    bb0, bb1 = _bend(b0, b1, e2z, b0, b1, e2z, share, apart, hits, i, k, i00, i01, i10, i11)
+    aa0, aa1 = _bend(a0, a1, e1z, a0, a1, e1z, share, apart, hits, k, i00, i01, i10, i11)
+    ab0, ab1 = _bend(a0, a1, e1z, b0, b1, e2z, share, apart, hits, k, i00, i01, i10, i11)
+    bb0, bb1 = _bend(b0, b1, e2z, b0, b1, e2z, share, apart, hits, k, i00, i01, i10, i11)
     det = a0 * b1 - a1 * b0
     # Growth of the picture's area per area along e1 and e2.
     grow_1 = (b1 * aa0 - b0 * aa1 - a1 * ab0 + a0 * ab1) / det
@@ -200,7 +162,6 @@ def _bend(
     share: float,
     apart: float,
     hits: FloatArray,
-    i: int,
     k: int,
     i00: float,
     i01: float,
@@ -214,12 +175,12 @@ def _bend(
     """
     aa, cross, bb = a0 * b0, a0 * b1 + a1 * b0, a1 * b1
     g0, g1 = (a0 * bz + b0 * az) / apart, (a1 * bz + b1 * az) / apart
-    x = (1 - share) * (hits[i, k, 3, 0] * aa + hits[i, k, 4, 0] * cross + hits[i, k, 5, 0] * bb)
-    x += share * (hits[i, k, 3, 2] * aa + hits[i, k, 4, 2] * cross + hits[i, k, 5, 2] * bb)
-    x += (hits[i, k, 1, 2] - hits[i, k, 1, 0]) * g0 + (hits[i, k, 2, 2] - hits[i, k, 2, 0]) * g1
-    y = (1 - share) * (hits[i, k, 3, 1] * aa + hits[i, k, 4, 1] * cross + hits[i, k, 5, 1] * bb)
-    y += share * (hits[i, k, 3, 3] * aa + hits[i, k, 4, 3] * cross + hits[i, k, 5, 3] * bb)
-    y += (hits[i, k, 1, 3] - hits[i, k, 1, 1]) * g0 + (hits[i, k, 2, 3] - hits[i, k, 2, 1]) * g1
+    x = (1 - share) * (hits[k, 3, 0] * aa + hits[k, 4, 0] * cross + hits[k, 5, 0] * bb)
+    x += share * (hits[k, 3, 2] * aa + hits[k, 4, 2] * cross + hits[k, 5, 2] * bb)
+    x += (hits[k, 1, 2] - hits[k, 1, 0]) * g0 + (hits[k, 2, 2] - hits[k, 2, 0]) * g1
+    y = (1 - share) * (hits[k, 3, 1] * aa + hits[k, 4, 1] * cross + hits[k, 5, 1] * bb)
+    y += share * (hits[k, 3, 3] * aa + hits[k, 4, 3] * cross + hits[k, 5, 3] * bb)
+    y += (hits[k, 1, 3] - hits[k, 1, 1]) * g0 + (hits[k, 2, 3] - hits[k, 2, 1]) * g1
     return -(i00 * x + i01 * y), -(i10 * x + i11 * y)
 
 
@@ -228,7 +189,6 @@ def led_view(
     centre: FloatArray,
     axis: FloatArray,
     hits: FloatArray,
-    i: int,
     k: int,
     plane_a: float,
     apart: float,
@@ -236,12 +196,12 @@ def led_view(
     J_centre: FloatArray,
     J_axis: FloatArray,
 ) -> tuple[float, float, float, float, float, float]:
-    """Return where LED ``k`` of frame ``i`` is seen, and fill in its derivatives.
+    """Return where LED ``k`` is seen, and fill in its derivatives.
 
     Parameters
     ----------
     centre, axis : ndarray, shape (3,), mm, camera frame
-    hits : ndarray, shape (n, n_leds, 6, 4)
+    hits : ndarray, shape (n_leds, 6, 4)
     plane_a, apart : float, mm
         Depth of plane a, and from it to plane b.
     shape : ndarray, shape (n_leds, N_SHAPE)
@@ -272,7 +232,7 @@ def led_view(
     per_sine = shape[k, SHIFT] + (s * per_height - shape[k, TANGENT]) * shape[k, SHIFT_1]
     slope = -shape[k, SHIFT_1] * per_height / s  # by the facing, -along
     x, y, z = centre[0] + per_sine * ax, centre[1] + per_sine * ay, centre[2] + per_sine * az
-    du, dv, i00, i01, i10, i11, kx, ky = pixel_near(x, y, (z - plane_a) / apart, hits, i, k)
+    du, dv, i00, i01, i10, i11, kx, ky = pixel_near(x, y, (z - plane_a) / apart, hits, k)
     kx, ky = kx / apart, ky / apart
     # Moving the LED turns its line of sight, and with it what is seen of the shift:
     # J (1 + p (1 - d d') - q across across'), and by the axis J (per_sine (1 - d d') - slope across d').

@@ -25,7 +25,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_a
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError
-from bricktrack_host.compiled import compiled, compiled_in_place
+from bricktrack_host.compiled import compiled, compiled_fast
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.hit_polynomials import hit_polynomials, hits_at
 
@@ -34,6 +34,7 @@ PrsoiForm = Literal["safe", "printed"]
 _MIN_DEPTH_MM = 1.0  # LEDs flatter than this leave the third column of H undetermined
 TOLERANCE_MM = 1e-7
 ROUGH_MM = 0.01  # of depth; the form's own error is several times that at 0.05 px of noise
+START_MM = 0.05  # a refinement ends at the same pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +112,8 @@ def prsoi_starts(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the PRSOI poses, (n, 3, 3) and (n, 3), of centroids (n, n_leds, 2), NaN where unseen.
 
-    ``tolerance_mm`` is where the iteration ends; `ROUGH_MM` will do where a refinement follows.
+    ``tolerance_mm`` is where the iteration ends; `ROUGH_MM` will do to judge a pose by its pixels,
+    `START_MM` to refine it.
     """
     a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
     hits = hits_at(hit_polynomials(ray_model), uv_px)
@@ -221,7 +223,7 @@ def _solve_frames(
         reference = 0
         while not seen[f, reference]:
             reference += 1
-        n_others, kappa = _differences(A, B, G, H, f, w, reference, seen, dA, BA, Gs, Hs, kappas)
+        n_others, kappa = _differences(A, B, G, H, f, w, reference, seen, printed, dA, BA, Gs, Hs, kappas)
         eps[:] = 0.0
         m, change, rounds = 0.0, np.inf, 0
         while change > tolerance_mm and rounds < max_iterations:
@@ -268,7 +270,7 @@ def _solve_frames(
                     t_all[f, r] -= rotation[r, c] * P[reference, c]
 
 
-@compiled_in_place
+@compiled_fast
 def _differences(
     A: FloatArray,
     B: FloatArray,
@@ -278,6 +280,7 @@ def _differences(
     w: int,
     reference: int,
     seen: BoolArray,
+    printed: bool,
     dA: FloatArray,
     BA: FloatArray,
     Gs: FloatArray,
@@ -287,7 +290,8 @@ def _differences(
     """Fill in what the LEDs seen beside the reference bring to a frame; return their number and kappa.
 
     That is hits on plane a less the reference's, what it is from there to plane b, rows of G and H, and the
-    ratio kappa of the hits' distances from the reference on the two planes, LED by LED and axis by axis.
+    ratio kappa of the hits' distances from the reference on the two planes; where ``printed``, also LED by
+    LED and axis by axis.
     """
     both, own, n_others = 0.0, 0.0, 0
     for k in range(seen.shape[1]):
@@ -296,7 +300,8 @@ def _differences(
                 dA[n_others, axis] = A[f, k, axis] - A[f, reference, axis]
                 BA[n_others, axis] = B[f, k, axis] - A[f, k, axis]
                 dB = B[f, k, axis] - B[f, reference, axis]
-                kappas[n_others, axis] = dB / dA[n_others, axis]  # eq. 6
+                if printed:
+                    kappas[n_others, axis] = dB / dA[n_others, axis]  # eq. 6
                 both, own = both + dA[n_others, axis] * dB, own + dA[n_others, axis] ** 2
             for c in range(3):
                 Gs[n_others, c], Hs[n_others, c] = G[w, k, c], H[w, c, k]
@@ -304,7 +309,7 @@ def _differences(
     return n_others, both / own
 
 
-@compiled_in_place
+@compiled_fast
 def _nearest_rotation(M: FloatArray, new: FloatArray, R: FloatArray) -> bool:
     """Put the rotation nearest to a matrix of positive determinant into ``R``, by Newton's polar iteration.
 
@@ -328,6 +333,6 @@ def _nearest_rotation(M: FloatArray, new: FloatArray, R: FloatArray) -> bool:
                 x = 0.5 * (R[r, c] + new[r, c] / det)
                 change = max(change, abs(x - R[r, c]))
                 R[r, c] = x
-        if change < 1e-15:
+        if change < 1e-8:  # the next would be its square
             break
     return True

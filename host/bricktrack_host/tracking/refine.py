@@ -15,9 +15,11 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.hit_polynomials import HitPolynomials, expand_at, hit_polynomials
+from bricktrack_host.tracking.hit_polynomials import hit_polynomials
+from bricktrack_host.tracking.led_outline import outlines_of
 from bricktrack_host.tracking.led_profile import shift_per_radius
-from bricktrack_host.tracking.refine_kernel import N_MORE, Fitted, Model, Observed, fit_frames, room_for
+from bricktrack_host.tracking.refine_kernel import fit_frames
+from bricktrack_host.tracking.refine_problem import N_MORE, Fitted, Model, Observed, room_for
 
 HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
@@ -26,7 +28,7 @@ MIN_LEDS = 4
 OWN_SHARE = 0.5
 """Of what the profile leaves unknown, each LED's own part beside the common one: bodies between a bare
 hemisphere and one with a collar of 2 r / 3, seen at 5 to 57 degrees, differ so much from one factor."""
-_CHUNK_FRAMES = 1024  # their rays fit into a core's second-level cache
+_CHUNK_FRAMES = 1024  # what one thread takes at a time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,13 +153,12 @@ def refine_poses(
     seen = all_finite(uv_px) & all_finite(cov_px2, 2)
     started = all_finite(R_start, 2) & all_finite(t_start_mm)
     model = _model(ray_model, brick_model, collar_mm, profile_is_exact)
-    polynomials = hit_polynomials(ray_model)
     out = _started(R_start, t_start_mm, n_leds)
     out.cost[~started | (seen.sum(axis=1) < MIN_LEDS)] = np.nan
 
     def fit(first: int) -> None:
         rows = slice(first, first + _CHUNK_FRAMES)
-        observed = _observed(uv_px[rows], cov_px2[rows], seen[rows], polynomials, motion, rows)
+        observed = _observed(uv_px, cov_px2, seen, motion, rows)
         fit_frames(observed, model, Fitted(*(field[rows] for field in out)), room_for(n_leds), max_steps)
 
     firsts = range(0, n, _CHUNK_FRAMES)
@@ -189,44 +190,45 @@ def refine_poses(
 def _model(
     ray_model: RayModel, brick_model: BrickModel, collar_mm: float | None, profile_is_exact: bool
 ) -> Model:
-    a, b = ray_model.plane_a_mm, ray_model.plane_b_mm
+    polynomials = hit_polynomials(ray_model)
+    outlines = outlines_of(brick_model.led_radii_mm, collar_mm)
     return Model(
         P=np.ascontiguousarray(brick_model.led_positions_mm),
         N=np.ascontiguousarray(brick_model.led_axes),
         radii=np.ascontiguousarray(brick_model.led_radii_mm),
-        collar=np.nan if collar_mm is None else float(collar_mm),
+        tables=outlines.tables,
+        kind=outlines.kind,
         shift_per_radius=shift_per_radius(collar_mm, brick_model),
         profile_sd=0.0 if profile_is_exact else 1.0,
         own_sd=OWN_SHARE,
-        plane_a=float(a),
-        apart=float(b - a),
+        cells=polynomials.cells,
+        cell_px=polynomials.cell_px,
+        plane_a=float(polynomials.plane_a_mm),
+        apart=float(polynomials.plane_b_mm - polynomials.plane_a_mm),
         huber=HUBER_SIGMAS,
     )
 
 
 def _observed(
-    uv: FloatArray,
-    cov: FloatArray,
-    seen: BoolArray,
-    polynomials: HitPolynomials,
-    motion: LedMotion | None,
-    rows: slice,
+    uv: FloatArray, cov: FloatArray, seen: BoolArray, motion: LedMotion | None, rows: slice
 ) -> Observed:
-    n, n_leds = seen.shape
-    nothing = np.zeros((n, n_leds, 3))
-    has_twist = motion is not None and motion.twist_sd is not None
+    n_leds = seen.shape[1]
+    if motion is None:
+        nothing = np.empty((0, n_leds, 3))
+        rvec, shift, dt, twist_sd = nothing, nothing, nothing[..., 0], None
+    else:
+        rvec, shift, dt = motion.rvec_brick_rad[rows], motion.shift_camera_mm[rows], motion.dt_s[rows]
+        twist_sd = None if motion.twist_sd is None else motion.twist_sd[rows]
     return Observed(
-        hits=expand_at(polynomials, np.where(seen[..., None], uv, 0.0)),
-        W=_inverse_2x2(np.where(seen[..., None, None], cov, np.eye(2))),
-        seen=seen,
+        uv=np.ascontiguousarray(uv[rows], dtype=np.float64),
+        cov=np.ascontiguousarray(cov[rows], dtype=np.float64),
+        seen=seen[rows],
         has_motion=motion is not None,
-        rvec=nothing if motion is None else np.ascontiguousarray(motion.rvec_brick_rad[rows]),
-        shift=nothing if motion is None else np.ascontiguousarray(motion.shift_camera_mm[rows]),
-        dt=nothing[..., 0] if motion is None else np.ascontiguousarray(motion.dt_s[rows]),
-        has_twist=has_twist,
-        twist_sd=np.ones((n, 6))
-        if motion is None or motion.twist_sd is None
-        else np.ascontiguousarray(motion.twist_sd[rows]),
+        rvec=np.ascontiguousarray(rvec),
+        shift=np.ascontiguousarray(shift),
+        dt=np.ascontiguousarray(dt),
+        has_twist=twist_sd is not None,
+        twist_sd=np.empty((0, 6)) if twist_sd is None else np.ascontiguousarray(twist_sd),
     )
 
 
@@ -243,9 +245,3 @@ def _started(R: FloatArray, t_mm: FloatArray, n_leds: int) -> Fitted:
         area=np.full((n, n_leds), np.nan),
         facing=np.full((n, n_leds), np.nan),
     )
-
-
-def _inverse_2x2(C: FloatArray) -> FloatArray:
-    det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] * C[..., 1, 0]
-    adjugate = np.stack([C[..., 1, 1], -C[..., 0, 1], -C[..., 1, 0], C[..., 0, 0]], axis=-1)
-    return np.asarray((adjugate / det[..., None]).reshape(C.shape))
