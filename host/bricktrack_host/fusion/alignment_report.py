@@ -10,7 +10,8 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.frame_stamps import StampCheck, check_stamps
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.mount import Mount, refine_mount
 from bricktrack_host.fusion.rotation_fit import Correlation, correlate
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times, has_pose

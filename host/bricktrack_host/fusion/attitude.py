@@ -3,7 +3,8 @@
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.fusion.imu_signal import ImuSignal, chain_rotations, usable_samples
+from bricktrack_host.fusion.imu_samples import usable_samples
+from bricktrack_host.fusion.imu_signal import ImuSignal, chain_rotations
 from bricktrack_host.tracks import ImuTrack
 
 _NODE_S = 0.0025  # of the integrated gyro: coning over it is below 1e-8 rad

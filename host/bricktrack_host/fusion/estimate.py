@@ -20,8 +20,9 @@ from bricktrack_host.fusion.camera_delay import settle_delay
 from bricktrack_host.fusion.contested_frames import with_contested_frames
 from bricktrack_host.fusion.cross_check import CrossCheck
 from bricktrack_host.fusion.fused_output import common_part, sample_motion
-from bricktrack_host.fusion.fusion_problem import NoiseLevel, Run
+from bricktrack_host.fusion.fusion_problem import Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.moving_camera import (
     NOT_OBSERVABLE,
     CameraAlignment,

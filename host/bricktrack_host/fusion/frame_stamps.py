@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.rotation_fit import Fit, RotationFit
 from bricktrack_host.fusion.stamp_regularity import (
     JITTER_NS,

@@ -8,10 +8,11 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import skew
-from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, NoiseLevel, Run
+from bricktrack_host.fusion.fusion_problem import Nodes, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_samples import seconds_since
-from bricktrack_host.fusion.inertial_noise import noise_parts
+from bricktrack_host.fusion.inertial_noise import NoiseLevel, noise_parts
+from bricktrack_host.fusion.linearisation import Linearisation
 from bricktrack_host.fusion.observation_kernel import LedArrays
 from bricktrack_host.fusion.smoother import Estimate, Problem
 from bricktrack_host.tracking.led_profile import LedPrediction, collar_of, predict_leds, shift_per_radius

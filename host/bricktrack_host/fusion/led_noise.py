@@ -11,10 +11,11 @@ from functools import cache
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.fusion.fusion_problem import Linearisation, Nodes, NoiseLevel, Run
+from bricktrack_host.fusion.fusion_problem import Nodes, Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.inertial_noise import NoiseParts, noise_parts
+from bricktrack_host.fusion.inertial_noise import NoiseLevel, NoiseParts, noise_parts
 from bricktrack_host.fusion.led_measurements import SeenLeds
+from bricktrack_host.fusion.linearisation import Linearisation
 from bricktrack_host.fusion.smoother import Problem, score_noise
 from bricktrack_host.fusion.smoother_kernel import NIS_CAP
 

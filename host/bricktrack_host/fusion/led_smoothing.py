@@ -8,8 +8,9 @@ from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_host.fusion.fused_output import sample_motion, sample_poses
-from bricktrack_host.fusion.fusion_problem import Nodes, NoiseLevel, Run, build_problem, place_nodes
+from bricktrack_host.fusion.fusion_problem import Nodes, Run, build_problem, place_nodes
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.led_measurements import Pictured, SeenLeds, led_arrays, led_chi2, picture
 from bricktrack_host.fusion.led_noise import (
     STATED_SCALES,

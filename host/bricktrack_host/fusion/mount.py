@@ -14,7 +14,8 @@ from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import matrix_from_quaternion, rvec_from_matrix
 from bricktrack_host.fusion.fusion_problem import Run, first_linearisation
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.noise_choice import frames_log_likelihood
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times, has_pose
 from bricktrack_host.tracks import ImuTrack, OpticalTrack

@@ -17,7 +17,8 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.attitude import Attitude, mean_rate
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.joint_alignment import align_jointly
 from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack

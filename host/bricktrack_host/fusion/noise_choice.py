@@ -6,17 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.fusion.fusion_problem import (
-    Linearisation,
-    Nodes,
-    NoiseLevel,
-    NoiseParts,
-    Run,
-    build_problem,
-    first_linearisation,
-    place_nodes,
-)
+from bricktrack_host.fusion.fusion_problem import Nodes, Run, build_problem, first_linearisation, place_nodes
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial_noise import NoiseLevel, NoiseParts
+from bricktrack_host.fusion.linearisation import Linearisation
 from bricktrack_host.fusion.sensor_errors import estimate_sensor_errors
 from bricktrack_host.fusion.smoother import LAG, LOSS, Estimate, Filter, Problem, residuals, score_noise
 

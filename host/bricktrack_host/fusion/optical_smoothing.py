@@ -16,7 +16,7 @@ from scipy.ndimage import uniform_filter1d
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_common.rotations import matrix_from_rvec, right_jacobian, rvec_from_matrix
-from bricktrack_host.fusion.imu_signal import seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial_hint import Felt, InertialHint
 from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, has_pose
 from bricktrack_host.quality import PoseFlag

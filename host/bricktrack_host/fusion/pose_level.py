@@ -10,17 +10,11 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.rotations import nearest_rotation
-from bricktrack_host.fusion.fusion_problem import (
-    Linearisation,
-    Nodes,
-    NoiseLevel,
-    Run,
-    build_problem,
-    first_linearisation,
-    place_nodes,
-)
+from bricktrack_host.fusion.fusion_problem import Nodes, Run, build_problem, first_linearisation, place_nodes
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.imu_signal import chain_rotations
+from bricktrack_host.fusion.inertial_noise import NoiseLevel
+from bricktrack_host.fusion.linearisation import Linearisation
 from bricktrack_host.fusion.noise_choice import frame_chi2, settle_noise
 from bricktrack_host.fusion.sensor_errors import with_sensor_doubt
 from bricktrack_host.fusion.smoother import (

@@ -12,7 +12,8 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ConfigError, TrackingError
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.imu_samples import seconds_since
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.rotation_fit import GRID_S, MIN_POSES, Fit, RotationFit, as_likely, correlate
 from bricktrack_host.fusion.sample_clock import RATE_SD, SampleClock, find_sample_clock
 from bricktrack_host.tracks import ImuTrack, OpticalTrack

@@ -5,8 +5,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from bricktrack_host.fusion.fusion_problem import NoiseLevel
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_noise import (
     STATED_SCALES,

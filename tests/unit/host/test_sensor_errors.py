@@ -8,8 +8,9 @@ from brick_shakes import LEVER_ARM_MM, simulate_shake
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.estimate import FusionInput, fuse, prepare_run
-from bricktrack_host.fusion.fusion_problem import NoiseLevel, build_problem, first_linearisation, place_nodes
+from bricktrack_host.fusion.fusion_problem import build_problem, first_linearisation, place_nodes
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.sensor_errors import SensorErrors, estimate_sensor_errors, with_sensor_doubt
 from bricktrack_host.fusion.smoother import POS, SEEN, Filter
 from bricktrack_host.quality import PoseFlag
