@@ -15,11 +15,12 @@ from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since, usable_samples
 from bricktrack_host.fusion.running_median import running_median
-from bricktrack_host.fusion.saw_tooth_kernel import likeliest_path, optics_cost, slip_cost
+from bricktrack_host.fusion.saw_tooth_kernel import grid_cost, likeliest_path, optics_cost, slip_cost
 from bricktrack_host.tracks import ImuTrack
 
 MIN_PAIRS = 60  # of frames side by side, for a search
 STEP_S = 0.0005  # of ages and offsets
+_GRID_STEPS = 2  # of the first search
 _MAX_RATE_ERROR = 0.012  # of the sensor's oscillator
 _SIDE_S = 0.008  # how far beside the coarse offset, which is half a saw-tooth wrong
 _BIN_S = 0.1  # of frame-to-frame rotations summed before the search
@@ -204,11 +205,15 @@ class SawToothSearch:
         """Return the best saw-tooth on a grid, by optics and by repeats that never came."""
         step = 3 * STEP_S / self.span_s
         n = int(_MAX_RATE_ERROR / step)
-        phases = np.arange(0.0, self.period_s, 2 * STEP_S)
-        lags = np.arange(-_SIDE_S, _SIDE_S + 1e-9, 2 * STEP_S) - 0.5 * self.period_s
+        phases = np.arange(0.0, self.period_s, _GRID_STEPS * STEP_S)
+        lags = np.arange(-_SIDE_S, _SIDE_S + 1e-9, _GRID_STEPS * STEP_S) - 0.5 * self.period_s
+        since_mid = self._bin_s - self._mid_s
         best = SawTooth(0.0, 0.0, 0.0, np.inf, 0.0)
         for rate in np.arange(-n, n + 1) * step:
-            cost = self._optics(rate, phases, lags)
+            cost = grid_cost(
+                self._cost, since_mid, self._lags_s[0], STEP_S, self.period_s * (1 + rate), rate, phases,
+                lags[0], _GRID_STEPS, len(lags),
+            )  # fmt: skip
             cost += self._slip_cost(rate, phases, STEP_S, entices=0.0)[0][:, None]
             i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
             if cost[i, j] < best.cost:
@@ -218,7 +223,7 @@ class SawToothSearch:
     def _refined(self, way: SawTooth) -> SawTooth:
         """Return what the optics like best near the best of a grid; the cost stays the grid's."""
         best = (np.inf, way.rate, way.phase_s, way.lag_s)
-        width = np.array([3 * STEP_S / self.span_s, 2 * STEP_S, 2 * STEP_S])
+        width = np.array([3 * STEP_S / self.span_s, _GRID_STEPS * STEP_S, _GRID_STEPS * STEP_S])
         for _ in range(4):
             _, rate, phase, lag = best
             phases, lags = phase + width[1] * np.linspace(-1, 1, 5), lag + width[2] * np.linspace(-1, 1, 5)
