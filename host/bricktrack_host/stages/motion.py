@@ -4,13 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.fused_output import unsure_times
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.imu_samples import BRIDGE_PERIODS
+from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
 from bricktrack_host.fusion.inertial_hint import InertialHint
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.tight import fuse_tight
@@ -18,8 +20,9 @@ from bricktrack_host.results.daq_clock import EdgeFit
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.stages.clocks import Inertial
 from bricktrack_host.tracking.first_poses import FirstPoses
-from bricktrack_host.tracking.frame_motion import led_motion, within_exposure_ns
+from bricktrack_host.tracking.frame_motion import led_motion, motion_to_leds, within_exposure_ns
 from bricktrack_host.tracking.optical_track import solve_poses
+from bricktrack_host.tracking.refine import LedMotion
 from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1
@@ -68,7 +71,7 @@ def retime(
     """Solve the poses again with each LED carried to its frame's instant by the fused motion.
 
     Splines through 30 frames a second cannot follow a motion above 15 Hz, and read-out takes 20 ms: the IMU
-    knows what the brick did meanwhile.
+    knows what the brick did meanwhile. Where its samples are missing, it does not, and the splines stay.
     """
     if inertial is None or inertial.is_hint or brick.imu_lever_arm_mm is None:
         return optical
@@ -83,10 +86,38 @@ def retime(
         except (ShapeError, TrackingError):
             return optical  # the fusion itself will say why
         motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)), n_instants=2)
+        motion = _with_splines(motion, optical, _frames_unfelt(optical, inertial))
         optical = solve_poses(observations, rays, brick, motion=motion, first=first)
         if not np.isfinite(optical.t_camera_brick_mm).any():
             break
     return optical
+
+
+def _frames_unfelt(optical: OpticalTrack, inertial: Inertial) -> BoolArray:
+    """Return which frames have an LED whose instant lies in a long gap of the inertial samples, or beyond."""
+    alignment = inertial.alignment
+    clock = alignment.sample_clock
+    signal = ImuSignal.from_track(inertial.imu if clock is None else clock.restamp(inertial.imu))
+    instants_ns = np.concatenate([optical.t_ns[:, None], optical.led_t_ns], axis=1)
+    t_s = seconds_since(alignment.imu_time_ns(instants_ns), signal.epoch_ns)
+    return np.asarray(signal.in_gap(t_s, least_periods=BRIDGE_PERIODS).any(axis=1))
+
+
+def _with_splines(motion: LedMotion, optical: OpticalTrack, frames: BoolArray) -> LedMotion:
+    """Return a motion within frames that in some of them is that of splines through the optical poses."""
+    if not frames.any() or motion.twist_sd is None:
+        return motion
+    splines = motion_to_leds(
+        optical.t_ns, optical.led_t_ns, optical.R_camera_brick, optical.t_camera_brick_mm
+    )
+    if splines.twist_sd is None:
+        return motion
+    return LedMotion(
+        rvec_brick_rad=np.where(frames[:, None, None], splines.rvec_brick_rad, motion.rvec_brick_rad),
+        shift_camera_mm=np.where(frames[:, None, None], splines.shift_camera_mm, motion.shift_camera_mm),
+        dt_s=np.where(frames[:, None], splines.dt_s, motion.dt_s),
+        twist_sd=np.where(frames[:, None], splines.twist_sd, motion.twist_sd),
+    )
 
 
 def _by_poses(
