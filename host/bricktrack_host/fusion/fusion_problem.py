@@ -9,10 +9,8 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.gap_fill import fill_of_gaps
 from bricktrack_host.fusion.imu_samples import CleanSamples, clean_samples, seconds_since
 from bricktrack_host.fusion.imu_signal import ImuSignal
-from bricktrack_host.fusion.inertial_noise import NoiseLevel as NoiseLevel
-from bricktrack_host.fusion.inertial_noise import NoiseParts as NoiseParts
-from bricktrack_host.fusion.inertial_noise import camera_noise, noise_parts
-from bricktrack_host.fusion.linearisation import Linearisation as Linearisation
+from bricktrack_host.fusion.inertial_noise import NoiseLevel, NoiseParts, camera_noise, noise_parts
+from bricktrack_host.fusion.linearisation import Linearisation
 from bricktrack_host.fusion.moving_camera import CameraMotion, imu_seconds, still_track
 from bricktrack_host.fusion.sensor_errors import SensorErrors
 from bricktrack_host.fusion.smoother import (
