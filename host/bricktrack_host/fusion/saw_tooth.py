@@ -162,13 +162,15 @@ class SawToothSearch:
         after = np.arange(4, n - 5)
         if len(after) < _KINK_WINDOW:
             return
+        spreads = {
+            numbers: _spread(np.abs(_departure(values, np.arange(3, n - 3), numbers, numbers)))
+            for numbers in (_PLAIN, *(holed for _, holed in _AROUND_A_HOLE))
+        }
         for place, holed in _AROUND_A_HOLE:
             rows = after + place
             chi2 = []
             for numbers in (_PLAIN, holed):
-                ordinary = np.abs(_departure(values, np.arange(3, n - 3), numbers, numbers))
-                spread = _spread(ordinary)[rows - 3]
-                off = _departure(values, rows, _PLAIN, numbers) / (spread + 1e-9)
+                off = _departure(values, rows, _PLAIN, numbers) / (spreads[numbers][rows - 3] + 1e-9)
                 chi2.append(np.minimum((off**2).sum(axis=1), _KINK_CAP))
             self._kink_gain[after] += chi2[1] - chi2[0]
         self._kink_gain = np.clip(self._kink_gain, -_KINK_TELLS, _KINK_TELLS)
