@@ -27,6 +27,7 @@ _MAX_TURN_RAD = 2.5  # rotation vectors from the middle attitude stay smooth bel
 _INNOVATION_GATE = 63.0  # five times the 95 % point of chi-square with 6: real motion is not stationary
 _NIS_CAP = 200.0  # so that an outlier does not choose the jerk
 _JERK_WINDOW_S = 0.5
+_JUMP_OVER_CALM = 20.0
 _VELOCITY = np.arange(9, 12)  # of the position, among the states
 # Densities of white jerk tried, rad^2/s^5 and mm^2/s^5: from a brick at rest to 50 mm at 10 Hz, and beyond,
 # more coarsely, to one that is put elsewhere from one frame to the next: there every frame stands for itself.
@@ -277,13 +278,47 @@ class _Smoothing:
         smoother = _Smoother(t_s, frame, self._z, self._z_cov, jerk[:, None], self._kicks(t_ns))
         x, P = smoother.smooth()
         at = back[len(frame_ns) :]
-        track = _to_track(x[at, 0], P[at, 0], self._middle, output_t_ns, frame_ns)
+        i = np.clip(np.searchsorted(frame_ns, output_t_ns) - 1, 0, len(frame_ns) - 2)
+        between = (output_t_ns > frame_ns[i]) & (output_t_ns < frame_ns[i + 1])
+        # Before the jump or after it: two answers as likely, and the smoothed one lies between them.
+        jump = np.where(between[:, None], _jumps(t_frame, self._z, self._z_cov)[i], 0.0)
+        P_out = P[at, 0]
+        P_out[:, :6, :6] += 0.25 * jump[:, :, None] * jump[:, None, :]
+        track = _to_track(x[at, 0], P_out, self._middle, output_t_ns, frame_ns)
         if self._turning is not None:
             track = _with_turning(track, self._turning)
         flags = track.flags
+        flags[jump.any(axis=1)] |= int(PoseFlag.IMPACT)
         if self._felt is not None:
             flags[self._felt.near_impact(output_t_ns)] |= int(PoseFlag.IMPACT)
         return _unsure_left_out(replace(track, covariance=track.covariance + self._common), self._settings)
+
+
+def _jumps(t_s: FloatArray, z: FloatArray, cov: FloatArray) -> FloatArray:
+    """Return by how much the pose jumps from each frame to the next, shape (n - 1, 6); zero where it moves.
+
+    A jump is what neither side foresees, by parabolas through three frames, while each side foresees its own
+    to a small part of that: calm before, calm after, and nothing says when it went from one to the other.
+    """
+    jumps = np.zeros((len(t_s) - 1, 6))
+    for k in range(3, len(t_s) - 4):
+        before, after = [k - 3, k - 2, k - 1, k], [k + 4, k + 3, k + 2, k + 1]
+        calm = [z[side[3]] - _parabola_at(t_s, z, side[:3], t_s[side[3]]) for side in (before, after)]
+        ahead = z[k + 1] - _parabola_at(t_s, z, before[1:], t_s[k + 1])
+        back = _parabola_at(t_s, z, after[1:], t_s[k]) - z[k]
+        for part in (slice(0, 3), slice(3, 6)):
+            usual = max(float(np.linalg.norm(c[part])) for c in calm)
+            usual = max(usual, float(np.sqrt(np.trace(cov[k][part, part] + cov[k + 1][part, part]))))
+            if min(np.linalg.norm(ahead[part]), np.linalg.norm(back[part])) > _JUMP_OVER_CALM * usual:
+                jumps[k, part] = 0.5 * (ahead + back)[part]
+    return jumps
+
+
+def _parabola_at(t_s: FloatArray, z: FloatArray, three: list[int], at_s: float) -> FloatArray:
+    """Return the parabola through three frames at another instant."""
+    t = t_s[three] - at_s
+    weights = [np.prod([-t[j] / (t[i] - t[j]) for j in range(3) if j != i]) for i in range(3)]
+    return np.asarray(np.array(weights) @ z[three])
 
 
 def _rotated(covariance: FloatArray, R: FloatArray) -> FloatArray:

@@ -84,3 +84,37 @@ def test_too_little_or_too_wild_is_refused():
         smooth_optical(replace(s.optical, R_camera_brick=spin), s.optical.t_ns)
     with pytest.raises(ShapeError, match="output_t_ns"):
         smooth_optical(s.optical, s.optical.t_ns[:, None])
+
+
+def test_a_frame_lost_where_the_brick_is_put_elsewhere_is_as_unsure_as_the_jump_is_wide():
+    # As in a sweep of poses, one a frame: steady steps, then elsewhere, and the first picture there is lost.
+    rng = np.random.default_rng(2)
+    s = simulate_shake(4, duration_s=0.7, amplitude_mm=0.0, rotation_deg=0.0)
+    n, jump_mm = len(s.optical.t_ns), np.array([47.0, 0.0, -31.0])
+    true_mm = 5.7 * np.arange(n)[:, None] * [0.0, 0.0, 1.0] + (np.arange(n) >= 10)[:, None] * jump_mm
+    seen_mm = true_mm + rng.normal(0, 0.02, (n, 3))
+    R = np.broadcast_to(s.R[0], (n, 3, 3)) @ Rotation.from_rotvec(rng.normal(0, 5e-4, (n, 3))).as_matrix()
+    seen_mm[10], R[10] = np.nan, np.nan
+    sd = np.repeat([5e-4, 0.02], 3)
+    optical = replace(
+        s.optical,
+        R_camera_brick=R,
+        t_camera_brick_mm=seen_mm,
+        covariance=np.broadcast_to(np.diag(sd**2), (n, 6, 6)),
+    )
+    track = smooth_optical(optical, optical.t_ns)
+    off_mm = track.t_camera_brick_mm - true_mm
+    chi2 = (off_mm * np.linalg.solve(track.covariance[:, 3:, 3:], off_mm[..., None])[..., 0]).sum(axis=1)
+    assert np.delete(np.abs(off_mm), 10, axis=0).max() < 0.1  # five sd of a frame
+    assert np.linalg.norm(off_mm[10]) > 10  # nothing tells which side of the jump it is on
+    assert chi2[10] < 16.3 and np.delete(chi2, 10).mean() < 6.0  # 3 degrees of freedom: one in 1000
+    marked = (track.flags & int(PoseFlag.IMPACT)) != 0
+    assert np.flatnonzero(marked).tolist() == [10]
+
+
+def test_sharp_frames_of_a_fast_shake_choose_a_roughness_that_follows_them():
+    s = simulate_shake(1, duration_s=5.0, position_sd_mm=0.02, rotation_sd_deg=0.02)
+    track = smooth_optical(s.optical, s.optical.t_ns, settings=WHITE)
+    # Frames are good to 0.02 mm; were they taken for outliers, the motion's millimetres would be smoothed away.
+    assert np.sqrt((errors(s, track)[:, 3:] ** 2).mean()) < 0.022
+    assert not (track.flags & int(PoseFlag.IMPACT)).any()
