@@ -19,8 +19,6 @@ from bricktrack_host.fusion.imu_samples import (
     fill_instants,
     roughness,
 )
-from bricktrack_host.fusion.imu_samples import seconds_since as seconds_since
-from bricktrack_host.fusion.imu_samples import usable_samples as usable_samples
 from bricktrack_host.fusion.signal_kernel import SignalPieces, integrate_steps
 from bricktrack_host.tracks import ImuTrack
 

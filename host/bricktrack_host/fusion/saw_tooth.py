@@ -13,7 +13,8 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since, usable_samples
+from bricktrack_host.fusion.imu_samples import seconds_since, usable_samples
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.running_median import running_median
 from bricktrack_host.fusion.saw_tooth_kernel import grid_cost, likeliest_path, optics_cost, slip_cost
 from bricktrack_host.tracks import ImuTrack

@@ -11,8 +11,8 @@ from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.fused_output import unsure_times
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_samples import BRIDGE_PERIODS
-from bricktrack_host.fusion.imu_signal import ImuSignal, seconds_since
+from bricktrack_host.fusion.imu_samples import BRIDGE_PERIODS, seconds_since
+from bricktrack_host.fusion.imu_signal import ImuSignal
 from bricktrack_host.fusion.inertial_hint import InertialHint
 from bricktrack_host.fusion.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.tight import fuse_tight
