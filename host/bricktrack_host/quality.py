@@ -45,12 +45,14 @@ class PoseFlag(IntFlag):
     DROPOUT = 128
     """Fused: no optical pose within one and a half frame periods."""
     IMPACT = 256
-    """The velocity changed faster than the sensors can follow: fused, by the accelerometer; optical, by a
-    moving frame whose LEDs obey no one motion. The covariance says so."""
+    """The velocity changed faster than the sensors can follow: fused, by the accelerometer, or where poses
+    jump between calm ones; optical, by a moving frame whose LEDs obey no one motion. The covariance says
+    so."""
     CLIPPED = 512
     """Fused: an inertial sample was at its range limit."""
     IMU_GAP = 1024
-    """Fused: inertial samples are missing here and were bridged by interpolation."""
+    """Fused: inertial samples are missing here and were bridged by interpolation, or where many are, by what
+    the camera saw."""
     EXTRAPOLATED = 2048
     """Fused: before the first or after the last optical pose."""
     OPTICAL_ONLY = 4096
@@ -59,7 +61,7 @@ class PoseFlag(IntFlag):
     """The stamps here disagree with the camera's steady rate or with the inertial samples, so the instant of
     the pose is unsure. The covariance says so."""
     CONTESTED = 16384
-    """Fused: a frame and the inertial samples contradict each other here, and either may be right. The pose
+    """Fused: a frame and all the rest contradict each other here, and either may be right. The pose
     is the mean of both, and the covariance reaches both."""
 
 
