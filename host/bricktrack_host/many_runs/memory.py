@@ -4,9 +4,10 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-_RUN_MEMORY_MB = 500
-_RUN_MEMORY_MB_PER_S = 2
-"""More than simulated runs of 1080p took: 463 MB at 16 s, 600 MB at 180 s (``peak_memory_mb`` of each)."""
+_RUN_MEMORY_MB = 550
+_RUN_MEMORY_MB_PER_S = 2.5
+"""More than simulated runs of 1080p took: 514 MB at 16 s (``scripts/bench_process.py``); and more than fusion
+alone at 180 s, 751 MB (``scripts/bench_memory.py``)."""
 _MEMORY_SHARE = 0.8
 _CGROUP = Path("/sys/fs/cgroup")
 
