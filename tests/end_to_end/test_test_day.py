@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.assemblies.combined_test import read_test
 from bricktrack_host.cli import test_day
+from bricktrack_host.cli._console import err, out
 from bricktrack_host.cli.main import app
 from bricktrack_host.results.result_store import write_results
 from bricktrack_host.transfer.unit_client import UnitClient
@@ -28,7 +29,7 @@ NAMES = ["b7-1", "b7-2", "b8-1"]
 
 
 def invoke(*words):
-    done = CliRunner().invoke(app, ["test", *(str(w) for w in words)], env={"COLUMNS": "200"})
+    done = CliRunner().invoke(app, ["test", *(str(w) for w in words)])
     return done.exit_code, " ".join(done.output.split())
 
 
@@ -45,6 +46,8 @@ def lab(tmp_path, monkeypatch):
         return 0
 
     monkeypatch.setattr(test_day, "process_folders", process)
+    for console in (out, err):
+        monkeypatch.setattr(console, "width", 200)
     monkeypatch.chdir(tmp_path)
     with LightFleet(tmp_path / "cards", NAMES, n_processes=1) as units:
         write_fleet_file(tmp_path / "fleet.toml", units.ports)
@@ -122,7 +125,7 @@ def test_a_unit_that_is_gone_stops_nobody(lab, tmp_path):
 
 def test_who_does_not_arm_is_named_and_the_rest_record(lab, tmp_path, monkeypatch):
     arm = UnitClient.arm
-    monkeypatch.setattr(UnitClient, "arm", lambda *words, **options: arm(*words, **options, timeout_s=1.0))
+    monkeypatch.setattr(UnitClient, "arm", lambda *words, **options: arm(*words, **options, patience_s=1.0))
     (tmp_path / "cards" / "b7-2" / "full").touch()
     (tmp_path / "cards" / "b8-1" / "mute").touch()
     assert invoke("new", "s3")[0] == 0

@@ -77,7 +77,7 @@ def loopback_up():
 
 def record(client, *, during=lambda: None):
     """Arm, drive a square wave, return the saved run and when its rises were written."""
-    run_id = client.arm(timeout_s=60).run_id
+    run_id = client.arm(patience_s=60).run_id
     time.sleep(0.3)
     wave = guest_knobs.square_wave(17, hz=20, n_periods=50)
     deadline = time.monotonic() + 5
@@ -174,7 +174,7 @@ def test_without_its_only_sensor_a_unit_refuses_to_arm_and_says_why(unit):
     guest_knobs.set_sensor("present", 0)
     try:
         with pytest.raises(UnitError, match=r"no sensor works.*IMU at I2C address 0x28"):
-            unit.arm(timeout_s=60)
+            unit.arm(patience_s=60)
     finally:
         guest_knobs.set_sensor("present", 1)
 

@@ -53,7 +53,7 @@ def test_one_run_holds_pictures_samples_and_edges_of_one_clock(tmp_path):
         time.sleep(0.05)
     client = UnitClient(f"tcp://127.0.0.1:{daemon.port}", timeout_s=60)
     try:
-        run_id = client.arm(timeout_s=90).run_id
+        run_id = client.arm(patience_s=90).run_id
         time.sleep(0.5)
         wave = guest_knobs.square_wave(17, hz=10, n_periods=20)
         rises = guest_knobs.rises_of(wave)

@@ -68,8 +68,8 @@ def create(file: FileOption = None, fleet: FleetOption = None) -> None:
     path = _key_path(file, _fleet_if_any(fleet))
     pair = create_host_key(path, name=_host_name())
     out.print(pair.public, markup=False)
-    err.print(f"Written to {path}; fingerprint {fingerprint(pair.public)}", markup=False)
-    err.print(f'Name it in fleet.toml, under [host]: secret_key = "{path}"', markup=False)
+    err.print(f"Written to {path}; fingerprint {fingerprint(pair.public)}", markup=False, soft_wrap=True)
+    err.print(f'Name it in fleet.toml, under [host]: secret_key = "{path}"', markup=False, soft_wrap=True)
 
 
 @app.command()

@@ -28,6 +28,7 @@ _INNOVATION_GATE = 63.0  # five times the 95 % point of chi-square with 6: real 
 _NIS_CAP = 200.0  # so that an outlier does not choose the jerk
 _JERK_WINDOW_S = 0.5
 _JUMP_OVER_CALM = 20.0
+_JUMP_WITHIN_PERIODS = 2.5  # one frame may be lost where the brick is put elsewhere
 _VELOCITY = np.arange(9, 12)  # of the position, among the states
 # Densities of white jerk tried, rad^2/s^5 and mm^2/s^5: from a brick at rest to 50 mm at 10 Hz, and beyond,
 # more coarsely, to one that is put elsewhere from one frame to the next: there every frame stands for itself.
@@ -299,9 +300,12 @@ def _jumps(t_s: FloatArray, z: FloatArray, cov: FloatArray) -> FloatArray:
 
     A jump is what neither side foresees, by parabolas through three frames, while each side foresees its own
     to a small part of that: calm before, calm after, and nothing says when it went from one to the other.
+    Over a longer gap no parabola foresees anything, and the smoother's own covariance holds.
     """
     jumps = np.zeros((len(t_s) - 1, 6))
-    for k in range(3, len(t_s) - 4):
+    steps = np.diff(t_s)
+    is_short = steps < _JUMP_WITHIN_PERIODS * np.median(steps)
+    for k in (np.flatnonzero(is_short[3:-3]) + 3).tolist():
         before, after = [k - 3, k - 2, k - 1, k], [k + 4, k + 3, k + 2, k + 1]
         calm = [z[side[3]] - _parabola_at(t_s, z, side[:3], t_s[side[3]]) for side in (before, after)]
         ahead = z[k + 1] - _parabola_at(t_s, z, before[1:], t_s[k + 1])
