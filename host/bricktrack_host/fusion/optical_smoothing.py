@@ -18,6 +18,7 @@ from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_common.rotations import matrix_from_rvec, right_jacobian, rvec_from_matrix
 from bricktrack_host.fusion.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial_hint import Felt, InertialHint
+from bricktrack_host.fusion.pose_neighbours import good_frames, interpolated, pose_jumps
 from bricktrack_host.fusion.time_alignment import MIN_ROTATION_SD_RAD, has_pose
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import FusedTrack, OpticalTrack
@@ -27,8 +28,6 @@ _MAX_TURN_RAD = 2.5  # rotation vectors from the middle attitude stay smooth bel
 _INNOVATION_GATE = 63.0  # five times the 95 % point of chi-square with 6: real motion is not stationary
 _NIS_CAP = 200.0  # so that an outlier does not choose the jerk
 _JERK_WINDOW_S = 0.5
-_JUMP_OVER_CALM = 20.0
-_JUMP_WITHIN_PERIODS = 2.5  # one frame may be lost where the brick is put elsewhere
 _VELOCITY = np.arange(9, 12)  # of the position, among the states
 # Densities of white jerk tried, rad^2/s^5 and mm^2/s^5: from a brick at rest to 50 mm at 10 Hz, and beyond,
 # more coarsely, to one that is put elsewhere from one frame to the next: there every frame stands for itself.
@@ -218,7 +217,7 @@ def _restlessness(t_ns: IntArray, R: FloatArray) -> float:
     """Return how far attitudes are from the cubic through two neighbours on each side, rad, rms."""
     t_s, rvec = seconds_since(t_ns, int(t_ns[0])), rvec_from_matrix(R[len(R) // 2].T @ R)
     k = range(2, len(R) - 2)
-    off = np.array([rvec[i] - _cubic_through(t_s, rvec, i, [i - 2, i - 1, i + 1, i + 2]) for i in k])
+    off = np.array([rvec[i] - interpolated(t_s, rvec, [i - 2, i - 1, i + 1, i + 2], t_s[i]) for i in k])
     squares = (off**2).sum(axis=1)
     # A frame thrown far off, or a dropout, shall not decide.
     return float(np.sqrt(np.mean(np.minimum(squares, np.quantile(squares, 0.95))))) if k else 0.0
@@ -257,7 +256,7 @@ class _Smoothing:
         z = np.concatenate([rvec, optical.t_camera_brick_mm[seen]], axis=1)
         z_cov = to_rvec @ cov @ np.swapaxes(to_rvec, 1, 2)
         self._epoch_ns = int(frame_ns[0])
-        good = _good_frames(seconds_since(frame_ns, self._epoch_ns), z, z_cov, settings.gate_chi2)
+        good = good_frames(seconds_since(frame_ns, self._epoch_ns), z, z_cov, settings.gate_chi2)
         self._frame_ns, self._z, self._z_cov = frame_ns[good], z[good], z_cov[good]
         self._t_s = seconds_since(self._frame_ns, self._epoch_ns)
         self._jerk = _choose_jerk(self._t_s, self._z, self._z_cov, self._kicks(self._frame_ns))
@@ -282,7 +281,7 @@ class _Smoothing:
         i = np.clip(np.searchsorted(frame_ns, output_t_ns) - 1, 0, len(frame_ns) - 2)
         between = (output_t_ns > frame_ns[i]) & (output_t_ns < frame_ns[i + 1])
         # Before the jump or after it: two answers as likely, and the smoothed one lies between them.
-        jump = np.where(between[:, None], _jumps(t_frame, self._z, self._z_cov)[i], 0.0)
+        jump = np.where(between[:, None], pose_jumps(t_frame, self._z, self._z_cov)[i], 0.0)
         P_out = P[at, 0]
         P_out[:, :6, :6] += 0.25 * jump[:, :, None] * jump[:, None, :]
         track = _to_track(x[at, 0], P_out, self._middle, output_t_ns, frame_ns)
@@ -293,36 +292,6 @@ class _Smoothing:
         if self._felt is not None:
             flags[self._felt.near_impact(output_t_ns)] |= int(PoseFlag.IMPACT)
         return _unsure_left_out(replace(track, covariance=track.covariance + self._common), self._settings)
-
-
-def _jumps(t_s: FloatArray, z: FloatArray, cov: FloatArray) -> FloatArray:
-    """Return by how much the pose jumps from each frame to the next, shape (n - 1, 6); zero where it moves.
-
-    A jump is what neither side foresees, by parabolas through three frames, while each side foresees its own
-    to a small part of that: calm before, calm after, and nothing says when it went from one to the other.
-    Over a longer gap no parabola foresees anything, and the smoother's own covariance holds.
-    """
-    jumps = np.zeros((len(t_s) - 1, 6))
-    steps = np.diff(t_s)
-    is_short = steps < _JUMP_WITHIN_PERIODS * np.median(steps)
-    for k in (np.flatnonzero(is_short[3:-3]) + 3).tolist():
-        before, after = [k - 3, k - 2, k - 1, k], [k + 4, k + 3, k + 2, k + 1]
-        calm = [z[side[3]] - _parabola_at(t_s, z, side[:3], t_s[side[3]]) for side in (before, after)]
-        ahead = z[k + 1] - _parabola_at(t_s, z, before[1:], t_s[k + 1])
-        back = _parabola_at(t_s, z, after[1:], t_s[k]) - z[k]
-        for part in (slice(0, 3), slice(3, 6)):
-            usual = max(float(np.linalg.norm(c[part])) for c in calm)
-            usual = max(usual, float(np.sqrt(np.trace(cov[k][part, part] + cov[k + 1][part, part]))))
-            if min(np.linalg.norm(ahead[part]), np.linalg.norm(back[part])) > _JUMP_OVER_CALM * usual:
-                jumps[k, part] = 0.5 * (ahead + back)[part]
-    return jumps
-
-
-def _parabola_at(t_s: FloatArray, z: FloatArray, three: list[int], at_s: float) -> FloatArray:
-    """Return the parabola through three frames at another instant."""
-    t = t_s[three] - at_s
-    weights = [np.prod([-t[j] / (t[i] - t[j]) for j in range(3) if j != i]) for i in range(3)]
-    return np.asarray(np.array(weights) @ z[three])
 
 
 def _rotated(covariance: FloatArray, R: FloatArray) -> FloatArray:
@@ -341,42 +310,6 @@ def _with_turning(track: FusedTrack, felt: Felt) -> FusedTrack:
         track, R_camera_brick=track.R_camera_brick @ B, omega_brick_radps=omega,
         covariance=_rotated(track.covariance, B_back),
     )  # fmt: skip
-
-
-def _cubic_through(t_s: FloatArray, z: FloatArray, k: int, others: list[int]) -> FloatArray:
-    """Return what the cubic through four other frames says of frame k."""
-    t = t_s[others] - t_s[k]
-    weights = [np.prod([-t[j] / (t[i] - t[j]) for j in range(4) if j != i]) for i in range(4)]
-    return np.asarray(np.array(weights) @ z[others])
-
-
-def _good_frames(t_s: FloatArray, z: FloatArray, cov: FloatArray, gate_chi2: float) -> BoolArray:
-    """Return which frames are no lone outliers.
-
-    A frame far off the cubic through two neighbours on each side is one only if its neighbours agree with
-    theirs once it is left out: at an impact they do not, and the frame stays.
-    """
-    n = len(t_s)
-    good = np.ones(n, dtype=np.bool_)
-
-    def off(k: int, without: int) -> float:
-        around = [i for i in range(k - 3, k + 4) if i not in (k, without) and 0 <= i < n and good[i]]
-        before, after = [i for i in around if i < k], [i for i in around if i > k]
-        if len(before) < 2 or len(after) < 2:
-            return np.inf
-        e = z[k] - _cubic_through(t_s, z, k, before[-2:] + after[:2])
-        # The cubic's own noise adds 17/18 of a frame's variance on an even grid.
-        return float(e @ np.linalg.solve(2 * cov[k], e))
-
-    alone = np.array([off(k, k) for k in range(n)])
-    far = np.where(np.isfinite(alone), alone, 0.0)
-    for k in np.argsort(-far):
-        if far[k] < gate_chi2:
-            break
-        least = max(gate_chi2, 0.05 * far[k])
-        if all(off(j, int(k)) < least for j in (k - 1, k + 1) if 0 <= j < n):
-            good[k] = False
-    return good
 
 
 def _to_track(
