@@ -23,6 +23,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_quaternion, rvec_from_matrix
 from bricktrack_host.calibration.calibration_file import load_calibration
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
+from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_fit import fit_collar
 from bricktrack_host.tracking.optical_track import observe_leds, solve_poses, start_poses
 from bricktrack_host.tracking.segment import Picture, find_blobs, paper_filter
@@ -67,7 +68,8 @@ def main() -> int:
             for name, model in profiles.items():
                 for rows in (False, True) if r.name == "motion" else (False,):
                     first = start_poses(seen[r.name, method], rays, model)
-                    told = with_measured_noise(seen[r.name, method], first, rays, model, rolling_shutter=rows)
+                    errors = frame_errors(seen[r.name, method], first, rays, model, rolling_shutter=rows)
+                    told = with_measured_noise(seen[r.name, method], errors)
                     track = solve_poses(told, rays, model, rolling_shutter=rows, first=first)
                     label = f"{r.name:9s}  {method:7s}  {name:7s}  {'yes' if rows else 'no ':3s}"
                     print(f"{label}   {r.judged(track)}")

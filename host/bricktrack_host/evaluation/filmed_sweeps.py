@@ -13,6 +13,7 @@ from bricktrack_host.evaluation.filmed import Film, Progress, make_film, open_fi
 from bricktrack_host.evaluation.scores import SweepScore, score_sweep
 from bricktrack_host.evaluation.sweeps import ROTATION_LIMIT_DEG, Sweep
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
+from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 
 _FRAME_S = 0.0333273
@@ -67,7 +68,8 @@ def evaluate_film(
         ("neither", bare, False),
     ):
         first = start_poses(observations, film.rays, brick)
-        told = with_measured_noise(observations, first, film.rays, brick, rolling_shutter=rows)
+        errors = frame_errors(observations, first, film.rays, brick, rolling_shutter=rows)
+        told = with_measured_noise(observations, errors)
         track = solve_poses(told, film.rays, brick, rolling_shutter=rows, first=first)
         scores[name] = [
             score_sweep(

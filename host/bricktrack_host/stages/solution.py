@@ -19,6 +19,7 @@ from bricktrack_host.stages.progress import Stages
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_fit import with_profile_of_run
 from bricktrack_host.tracking.odd_leds import with_odd_leds_doubted, words_on_odd_leds
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
@@ -66,13 +67,10 @@ def solve_run(
         brick = with_profile_of_run(
             observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
         )
-        observations = with_odd_leds_doubted(
-            observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
-        )
+        errors = frame_errors(observations, first, rays, brick, rolling_shutter=settings.rolling_shutter)
+        observations, errors = with_odd_leds_doubted(observations, errors)
         problems += words_on_odd_leds(observations, brick)
-        observations = with_measured_noise(
-            observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
-        )
+        observations = with_measured_noise(observations, errors)
         optical = solve_poses(
             observations, rays, brick, rolling_shutter=settings.rolling_shutter, first=first
         )

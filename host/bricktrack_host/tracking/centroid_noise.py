@@ -15,10 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_common.brick_model import BrickModel
-from bricktrack_common.camera_model import RayModel
-from bricktrack_host.tracking.first_poses import FirstPoses
-from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors, frame_errors
+from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors
 from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
 from bricktrack_host.tracks import LedObservations
 
@@ -52,28 +49,17 @@ class CentroidNoise:
     n_frames: int
 
 
-def with_measured_noise(
-    observations: LedObservations,
-    first: FirstPoses,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    *,
-    rolling_shutter: bool = True,
-) -> LedObservations:
+def with_measured_noise(observations: LedObservations, errors: FrameErrors) -> LedObservations:
     """Return observations with the run's own noise in their covariances in place of the floor.
 
     Parameters
     ----------
     observations : LedObservations
         With covariances as the segmentation states them: the pixels' noise and `FLOOR_SD_PX`.
-    first : FirstPoses
+    errors : FrameErrors
         Of the same observations.
-    ray_model : RayModel
-    brick_model : BrickModel
-    rolling_shutter : bool
-        False: the frames are taken for instants.
     """
-    noise = measure_noise(observations, first, ray_model, brick_model, rolling_shutter=rolling_shutter)
+    noise = measure_noise(errors)
     logger.info(
         "centroids: %.3f px from %.0f independent residuals in %d frames",
         noise.sd_px,
@@ -84,15 +70,8 @@ def with_measured_noise(
     return replace(observations, cov_px2=observations.cov_px2 + more)
 
 
-def measure_noise(
-    observations: LedObservations,
-    first: FirstPoses,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    *,
-    rolling_shutter: bool = True,
-) -> CentroidNoise:
-    """Return the noise of a run's centroids; see `with_measured_noise`.
+def measure_noise(errors: FrameErrors, leds: BoolArray | None = None) -> CentroidNoise:
+    """Return the noise of a run's centroids; of some LEDs of each frame if they are given, (n, n_leds).
 
     Notes
     -----
@@ -101,12 +80,7 @@ def measure_noise(
     without what lies beyond three sigmas. The answer is the mean of the inverse chi-square that prior and
     residuals give, which for few residuals is larger than their variance.
     """
-    errors = frame_errors(observations, first, ray_model, brick_model, rolling_shutter=rolling_shutter)
-    return noise_of(errors, errors.seen)
-
-
-def noise_of(errors: FrameErrors, leds: BoolArray) -> CentroidNoise:
-    """Return the noise that some LEDs of each frame show, (n, n_leds); see `measure_noise`."""
+    leds = errors.seen if leds is None else leds
     enough = np.flatnonzero(leds.sum(axis=1) >= MIN_LEDS)
     if enough.size == 0:
         return CentroidNoise(FLOOR_SD_PX, float("nan"), 0.0, 0)

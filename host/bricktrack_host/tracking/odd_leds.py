@@ -11,11 +11,9 @@ from scipy.special import fdtrc
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
-from bricktrack_common.camera_model import RayModel
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.centroid_noise import noise_of
-from bricktrack_host.tracking.first_poses import FirstPoses
-from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors, frame_errors
+from bricktrack_host.tracking.centroid_noise import measure_noise
+from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors
 from bricktrack_host.tracks import LedObservations
 
 _CHANCE = 1e-4
@@ -23,37 +21,30 @@ _LEAST_PX = 0.15  # what a profile's or a ray's own error may be
 
 
 def with_odd_leds_doubted(
-    observations: LedObservations,
-    first: FirstPoses,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    *,
-    rolling_shutter: bool = True,
-) -> LedObservations:
+    observations: LedObservations, errors: FrameErrors
+) -> tuple[LedObservations, FrameErrors]:
     """Return observations in which LEDs that contradict all the others throughout are doubted by as much.
 
     Parameters
     ----------
     observations : LedObservations
         With covariances as the segmentation states them.
-    first : FirstPoses
+    errors : FrameErrors
         Of the same observations.
-    ray_model : RayModel
-    brick_model : BrickModel
-    rolling_shutter : bool
-        False: the frames are taken for instants.
 
     Returns
     -------
-    LedObservations
+    LedObservations, FrameErrors
         Odd LEDs have `LedFlag.OUTLIER`, and the variance that their distance from the others' word is.
     """
-    errors = frame_errors(observations, first, ray_model, brick_model, rolling_shutter=rolling_shutter)
     off_px = odd_leds_px(errors)
     odd = off_px > 0
-    cov = observations.cov_px2 + (off_px**2)[:, None, None] * np.eye(2)
+    doubt_px2 = (off_px**2)[:, None, None] * np.eye(2)
     flags = np.where(odd & np.isfinite(observations.uv_px[..., 0]), int(LedFlag.OUTLIER), 0)
-    return replace(observations, cov_px2=cov, led_flags=observations.led_flags | flags)
+    doubted = replace(
+        observations, cov_px2=observations.cov_px2 + doubt_px2, led_flags=observations.led_flags | flags
+    )
+    return doubted, replace(errors, own_px2=errors.own_px2 + doubt_px2)
 
 
 def words_on_odd_leds(observations: LedObservations, brick_model: BrickModel) -> list[str]:
@@ -96,7 +87,7 @@ def _beside_the_others(errors: FrameErrors, leds: BoolArray, k: int) -> tuple[fl
     """Return an LED's distance from where the others put it, their noise, px, and the chance of as much."""
     others = leds.copy()
     others[:, k] = False
-    noise = noise_of(errors, others)
+    noise = measure_noise(errors, others)
     frames = np.flatnonzero(leds[:, k] & (others.sum(axis=1) >= MIN_LEDS))
     if frames.size == 0 or noise.n_frames == 0:
         return 0.0, noise.sd_px, 1.0

@@ -7,6 +7,7 @@ from pinhole import PinholeCamera
 
 from bricktrack_common.brick_model import ProfileEntry
 from bricktrack_host.tracking.centroid_noise import measure_noise, with_measured_noise
+from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_profile import predict_brick
 from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
@@ -34,7 +35,7 @@ def seen(R, t, error_px):
 
 def measured(observations):
     first = start_poses(observations, CAMERA, BRICK)
-    return measure_noise(observations, first, CAMERA, BRICK, rolling_shutter=False)
+    return measure_noise(frame_errors(observations, first, CAMERA, BRICK, rolling_shutter=False))
 
 
 @pytest.mark.parametrize("sd_px", [0.01, 0.03, 0.12])
@@ -74,7 +75,7 @@ def test_without_a_pose_the_floor_stays():
     noise = measured(observations)
     assert (noise.sd_px, noise.n_frames) == (FLOOR_SD_PX, 0)
     first = start_poses(observations, CAMERA, BRICK)
-    kept = with_measured_noise(observations, first, CAMERA, BRICK)
+    kept = with_measured_noise(observations, frame_errors(observations, first, CAMERA, BRICK))
     np.testing.assert_array_equal(kept.cov_px2, observations.cov_px2)
 
 
@@ -83,7 +84,8 @@ def test_poses_with_the_measured_noise_are_as_good_as_they_say():
     R, t = random_poses(n, seed=8)
     observations = seen(R, t, np.random.default_rng(9).normal(0, 0.02, (n, 7, 2)))
     first = start_poses(observations, CAMERA, BRICK)
-    told = with_measured_noise(observations, first, CAMERA, BRICK, rolling_shutter=False)
+    errors = frame_errors(observations, first, CAMERA, BRICK, rolling_shutter=False)
+    told = with_measured_noise(observations, errors)
     shift_of = []
     for each in (observations, told):
         track = solve_poses(each, CAMERA, BRICK, rolling_shutter=False)

@@ -83,13 +83,14 @@ def test_poses_are_freed_of_an_odd_led_and_say_so():
     R, t = shaken(11)
     observations = seen(R, t, off_px=off(6, 1.0, 0.7), seed=12)
     first = start_poses(observations, CAMERA, BRICK)
-    doubted = with_odd_leds_doubted(observations, first, CAMERA, BRICK, rolling_shutter=False)
+    errors = frame_errors(observations, first, CAMERA, BRICK, rolling_shutter=False)
+    doubted, doubted_errors = with_odd_leds_doubted(observations, errors)
     assert ((doubted.led_flags == LedFlag.OUTLIER) == (np.arange(7) == 6)).all()
     assert [words_on_odd_leds(o, BRICK) != [] for o in (observations, doubted)] == [False, True]
     assert "LED m6" in words_on_odd_leds(doubted, BRICK)[0]
     rms_mm = []
-    for each in (observations, doubted):
-        told = with_measured_noise(each, first, CAMERA, BRICK, rolling_shutter=False)
+    for each, of_each in ((observations, errors), (doubted, doubted_errors)):
+        told = with_measured_noise(each, of_each)
         track = solve_poses(told, CAMERA, BRICK, first=first, rolling_shutter=False)
         rms_mm.append(np.sqrt(np.mean((track.t_camera_brick_mm - t) ** 2)))
     assert rms_mm[1] < 0.3 * rms_mm[0]
