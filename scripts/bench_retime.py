@@ -23,23 +23,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 
 from daemon_runs import DaemonRun, simulate_run
 
-from bricktrack_common.arrays import FloatArray
+from bricktrack_common.arrays import FloatArray, rows_of
 from bricktrack_host.fusion.estimate import fuse
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.time_alignment import align_times
 from bricktrack_host.tracking.frame_motion import led_motion
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
-from bricktrack_host.tracks import FusedTrack
 
 CHOICES = {
     "noise chosen": FusionSettings(),
     "noise as stated": FusionSettings(adapt_noise=False),
 }
-
-
-def rows(motion: FusedTrack, part: slice) -> FusedTrack:
-    """Return some instants of a motion."""
-    return FusedTrack(*(getattr(motion, name)[part] for name in FusedTrack.__slots__))
 
 
 def squares_mm2(found_mm: FloatArray, true_mm: FloatArray) -> FloatArray:
@@ -63,7 +57,7 @@ def errors_of(run: DaemonRun) -> dict[str, tuple[float, float, float]]:
             alignment=alignment, settings=settings,
         ).track  # fmt: skip
         seconds = time.process_time() - started
-        within = led_motion(rows(motion, slice(0, n)), rows(motion, slice(n, None)))
+        within = led_motion(rows_of(motion, slice(0, n)), rows_of(motion, slice(n, None)))
         poses = solve_poses(observations, camera, brick, motion=within, first=first)
         fused = fuse(
             poses, run.imu, lever_arm_mm=run.lever_arm_mm, output_t_ns=t_ns, alignment=alignment

@@ -1,13 +1,18 @@
-"""Array aliases, and the one check of shape at the door of public functions."""
+"""Array aliases, the one check of shape at the door of public functions, and rows of records of arrays."""
 
+from dataclasses import fields, is_dataclass, replace
 from types import EllipsisType
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bricktrack_common.errors import ShapeError
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Record = TypeVar("Record", bound="DataclassInstance")
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -53,3 +58,28 @@ def as_float_array(name: str, values: ArrayLike, shape: tuple[int | EllipsisType
         comma = "," if len(shape) == 1 else ""
         raise ShapeError(f"{name} has shape {array.shape}; expected ({expected}{comma})")
     return array
+
+
+def rows_of(record: Record, rows: IntArray | BoolArray | slice) -> Record:
+    """Return a dataclass of arrays with some rows of each, and of the records in it; all else stays."""
+    chosen: dict[str, Any] = {}
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, np.ndarray):
+            chosen[field.name] = value[rows]
+        elif is_dataclass(value) and not isinstance(value, type):
+            chosen[field.name] = rows_of(value, rows)
+    return replace(record, **chosen)
+
+
+def with_rows(record: Record, rows: IntArray | BoolArray, by: Record) -> Record:
+    """Return a dataclass of arrays, and of records of them, with some rows replaced by those of another."""
+    changed: dict[str, Any] = {}
+    for field in fields(record):
+        value, new = getattr(record, field.name), getattr(by, field.name)
+        if isinstance(value, np.ndarray):
+            changed[field.name] = value.copy()
+            changed[field.name][rows] = new
+        elif is_dataclass(value) and not isinstance(value, type):
+            changed[field.name] = with_rows(value, rows, new)
+    return replace(record, **changed)

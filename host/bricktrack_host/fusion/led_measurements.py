@@ -1,10 +1,10 @@
 """LEDs one by one as the smoother's measurements: each at its own row's instant, through the ray model."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import skew
@@ -61,7 +61,7 @@ class SeenLeds:
 
     def take(self, rows: BoolArray) -> "SeenLeds":
         """Return some of the rows."""
-        return SeenLeds(*(getattr(self, f.name)[rows] for f in fields(self)))
+        return rows_of(self, rows)
 
     def beside_ns(self) -> IntArray:
         """Return one spread before the middle of each one's light and one after, shape (2, m)."""

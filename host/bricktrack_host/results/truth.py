@@ -9,7 +9,7 @@ from rich import box
 from rich.table import Table
 from scipy.special import chdtri
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.quality import PoseFlag
@@ -198,9 +198,7 @@ class _Errors:
         )
 
     def select(self, mask: BoolArray) -> "_Errors":
-        return _Errors(
-            self.error[mask], self.sd[mask], self.nees[mask], self.has_truth[mask], self.has_pose[mask]
-        )
+        return rows_of(self, mask)
 
 
 def _rest_errors(

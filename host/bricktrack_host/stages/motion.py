@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
@@ -85,7 +85,7 @@ def retime(
             ).track
         except (ShapeError, TrackingError):
             return optical  # the fusion itself will say why
-        motion = led_motion(_rows(track, slice(0, n)), _rows(track, slice(n, None)), n_instants=2)
+        motion = led_motion(rows_of(track, slice(0, n)), rows_of(track, slice(n, None)), n_instants=2)
         motion = _with_splines(motion, optical, _frames_unfelt(optical, inertial))
         optical = solve_poses(observations, rays, brick, motion=motion, first=first)
         if not np.isfinite(optical.t_camera_brick_mm).any():
@@ -170,7 +170,7 @@ def fuse_run(
         track = smooth_optical(optical, wanted, hint=hint)
     ends = np.cumsum([len(t) for t in grid.t_ns.values()])
     parts = {
-        kind: _rows(track, slice(end - len(t), end))
+        kind: rows_of(track, slice(end - len(t), end))
         for (kind, t), end in zip(grid.t_ns.items(), ends.tolist(), strict=True)
     }
     return parts, fusion
@@ -222,15 +222,3 @@ def with_unsure_times(
         spread, flags = unsure_times(track.t_ns, frames_ns, time_sd_ns, velocity)
         widened[kind] = replace(track, covariance=track.covariance + spread, flags=track.flags | flags)
     return optical, widened
-
-
-def _rows(track: FusedTrack, rows: slice) -> FusedTrack:
-    return FusedTrack(
-        t_ns=track.t_ns[rows],
-        R_camera_brick=track.R_camera_brick[rows],
-        t_camera_brick_mm=track.t_camera_brick_mm[rows],
-        omega_brick_radps=track.omega_brick_radps[rows],
-        v_camera_mmps=track.v_camera_mmps[rows],
-        covariance=track.covariance[rows],
-        flags=track.flags[rows],
-    )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of, with_rows
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.refine import OWN_SHARE
 
@@ -45,13 +45,11 @@ class Evidence:
 
     def take(self, rows: IntArray) -> "Evidence":
         """Return that of some assignments."""
-        return Evidence(self.log_ratio[rows], self.is_scattered[rows])
+        return rows_of(self, rows)
 
     def replaced(self, rows: IntArray, by: "Evidence") -> "Evidence":
         """Return this with that of some assignments replaced."""
-        out = Evidence(self.log_ratio.copy(), self.is_scattered.copy())
-        out.log_ratio[rows], out.is_scattered[rows] = by.log_ratio, by.is_scattered
-        return out
+        return with_rows(self, rows, by)
 
 
 def evidence_of(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.arrays import BoolArray, FloatArray, rows_of
 from bricktrack_common.brick_model import DEFAULT_SHIFT_SD_PER_RADIUS, BrickModel, ProfileEntry
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
@@ -18,7 +18,7 @@ from bricktrack_host.tracking.first_poses import FirstPoses, first_poses
 from bricktrack_host.tracking.frame_motion import calm_frames, carried_px, led_times_ns, motion_to_leds
 from bricktrack_host.tracking.led_profile import UNKNOWN_SHIFT_PER_RADIUS, predict_brick, shift_per_radius
 from bricktrack_host.tracking.refine import OWN_SHARE, RefinedPoses, refine_poses
-from bricktrack_host.tracking.sweep_frames import frames_of, rms_px, sweep_frames
+from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
 from bricktrack_host.tracks import LedObservations
 
 _MIN_LEDS = 5  # four leave two degrees of freedom, which one collar and a false pose share too easily
@@ -182,7 +182,7 @@ def with_profile_of_run(
     uv_px = first.uv_px[frames]
     if motion is not None and frames.size:
         uv_px = uv_px - carried_px(motion, first, frames, ray_model, brick_model)
-    few = replace(frames_of(observations, frames), uv_px=uv_px)
+    few = replace(rows_of(observations, frames), uv_px=uv_px)
     try:
         fit = fit_collar(few, ray_model, brick_model)
     except CalibrationError:

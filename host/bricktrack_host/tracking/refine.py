@@ -6,11 +6,11 @@ frame's instant and the LED's.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of, with_rows
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
@@ -91,14 +91,11 @@ class RefinedPoses:
 
     def take(self, rows: IntArray) -> "RefinedPoses":
         """Return the poses of some frames."""
-        return RefinedPoses(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return rows_of(self, rows)
 
     def replaced(self, rows: IntArray, by: "RefinedPoses") -> "RefinedPoses":
         """Return these poses with those of some frames replaced."""
-        values = {f.name: getattr(self, f.name).copy() for f in fields(self)}
-        for name, value in values.items():
-            value[rows] = getattr(by, name)
-        return RefinedPoses(**values)
+        return with_rows(self, rows, by)
 
 
 def refine_poses(

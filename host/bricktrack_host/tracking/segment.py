@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import FloatArray, IntArray, rows_of
 from bricktrack_common.errors import ShapeError
 from bricktrack_host.tracking import light_kernel as k
 from bricktrack_host.tracking.centroids import flat_bytes, linear_light_of_luma
@@ -72,14 +72,7 @@ class Blobs:
 
     def take(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> "Blobs":
         """Return a selection of the blobs."""
-        return Blobs(
-            uv_px=self.uv_px[which],
-            cov_px2=self.cov_px2[which],
-            area_px2=self.area_px2[which],
-            eccentricity=self.eccentricity[which],
-            fill=self.fill[which],
-            flags=self.flags[which],
-        )
+        return rows_of(self, which)
 
 
 def find_blobs(picture: Picture, *, radius_px: float | None = None) -> Blobs:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import FloatArray, rows_of
 from bricktrack_common.errors import CalibrationError
 from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_tracker import NOT_USED
@@ -37,20 +37,7 @@ def sweep_frames(
             "Record a sweep with all LEDs in view."
         )
     whole = replace(observations, uv_px=np.where(used[..., None], observations.uv_px, np.nan))
-    return frames_of(whole, frames)
-
-
-def frames_of(observations: LedObservations, frames: IntArray) -> LedObservations:
-    """Return the observations of some frames alone."""
-    return LedObservations(
-        sensor_timestamp_ns=observations.sensor_timestamp_ns[frames],
-        exposure_ns=observations.exposure_ns[frames],
-        uv_px=observations.uv_px[frames],
-        cov_px2=observations.cov_px2[frames],
-        area_px2=observations.area_px2[frames],
-        led_flags=observations.led_flags[frames],
-        frame_flags=observations.frame_flags[frames],
-    )
+    return rows_of(whole, frames)
 
 
 def rms_px(residual_px: FloatArray) -> float:

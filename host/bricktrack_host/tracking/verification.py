@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of, with_rows
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_host.tracking.evidence import Evidence, evidence_of
@@ -109,7 +109,7 @@ class LedLights:
 
     def take(self, rows: IntArray) -> "LedLights":
         """Return some of the assignments."""
-        return LedLights(self.uv_px[rows], self.cov_px2[rows], self.area_px2[rows], self.is_whole[rows])
+        return rows_of(self, rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,13 +183,11 @@ class Verified:
 
     def take(self, rows: IntArray) -> "Verified":
         """Return some of the assignments."""
-        return Verified(self.kept[rows], self.poses.take(rows), self.log_evidence[rows])
+        return rows_of(self, rows)
 
     def replaced(self, rows: IntArray, by: "Verified") -> "Verified":
         """Return these with some replaced."""
-        kept, log_evidence = self.kept.copy(), self.log_evidence.copy()
-        kept[rows], log_evidence[rows] = by.kept, by.log_evidence
-        return Verified(kept, self.poses.replaced(rows, by.poses), log_evidence)
+        return with_rows(self, rows, by)
 
 
 def verify(

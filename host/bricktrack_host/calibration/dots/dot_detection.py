@@ -6,7 +6,7 @@ light does not pull the centre. It is the centroid of the *image* of the disc;
 `calibration.disc_bias` takes it to the image of the disc's centre once a lens model is at hand.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.arrays import BoolArray, FloatArray, rows_of
 from bricktrack_common.errors import CalibrationError, ShapeError
 from bricktrack_host.calibration.dots.cut_dots import CompletedDot, complete_cut_dot
 from bricktrack_host.calibration.dots.dot_regions import (
@@ -73,17 +73,7 @@ class Dots:
 
     def select(self, keep: BoolArray) -> "Dots":
         """Return the dots where ``keep`` is true."""
-        return replace(
-            self,
-            uv_px=self.uv_px[keep],
-            cov_px2=self.cov_px2[keep],
-            area_px2=self.area_px2[keep],
-            touches_border=self.touches_border[keep],
-            is_completed=self.is_completed[keep],
-            blur_px=self.blur_px[keep],
-            light_grey=self.light_grey[keep],
-            dark_grey=self.dark_grey[keep],
-        )
+        return rows_of(self, keep)
 
 
 def detect_dots(grey: GreyImage, *, polarity: Polarity = "auto", keep_cut_dots: bool = False) -> Dots:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.errors import CalibrationError
 
 MAX_TURN_BETWEEN_PLANES_DEG = 20.0
@@ -44,14 +44,7 @@ class DotObservations:
 
     def select(self, keep: BoolArray) -> "DotObservations":
         """Return the dots where ``keep`` is true."""
-        return DotObservations(
-            self.uv_px[keep],
-            self.xy_mm[keep],
-            self.cov_px2[keep],
-            self.area_px2[keep],
-            self.column_row[keep],
-            self.size if isinstance(self.size, float) else self.size[keep],
-        )
+        return rows_of(self, keep)
 
     def moved_to(self, uv_px: FloatArray) -> "DotObservations":
         """Return the same dots with other image points, shape (n, 2)."""
