@@ -30,9 +30,9 @@ from scipy.stats import t as student_t
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.estimate import FusionInput, fuse, fuse_batch
-from bricktrack_host.fusion.imu_signal import chain_rotations
-from bricktrack_host.fusion.time_alignment import align_times
+from bricktrack_host.fusion.inertial.imu_signal import chain_rotations
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 

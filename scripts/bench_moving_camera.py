@@ -24,7 +24,7 @@ from two_imus import IMU_TO_CAMERA_MM, simulate_two_imus
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_host.fusion.estimate import fuse
-from bricktrack_host.fusion.moving_camera import CameraImu
+from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraImu
 
 DROPOUTS = ((2.0, 2.4), (3.6, 3.9), (5.0, 5.5))
 MOTIONS = ((0.0, 0.0), (0.3, 0.0), (0.3, 0.7), (0.3, 1.4), (0.3, 2.0))  # g and degrees, rms in each axis

@@ -26,7 +26,7 @@ from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_fit import fit_collar
 from bricktrack_host.tracking.optical_track import observe_leds, solve_poses, start_poses
-from bricktrack_host.tracking.segment import Picture, find_blobs, paper_filter
+from bricktrack_host.tracking.pictures.segment import Picture, find_blobs, paper_filter
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
 FIRST_STAMP_NS = {"static": 4823310455208, "motion": 5118442907613}  # rig.toml

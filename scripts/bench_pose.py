@@ -25,11 +25,11 @@ from bricktrack_host.evaluation.bound import cramer_rao_covariance
 from bricktrack_host.evaluation.paper_brick import paper_brick
 from bricktrack_host.evaluation.simulated_points import points_of
 from bricktrack_host.evaluation.true_camera import TrueCamera
-from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
+from bricktrack_host.tracking.identity.pattern import follow_pattern
+from bricktrack_host.tracking.led_model.hit_polynomials import expand_at, hit_polynomials
 from bricktrack_host.tracking.optical_track import solve_poses
-from bricktrack_host.tracking.pattern import follow_pattern
-from bricktrack_host.tracking.prsoi import START_MM, prsoi_starts
-from bricktrack_host.tracking.refine import LedMotion, refine_poses
+from bricktrack_host.tracking.pose.prsoi import START_MM, prsoi_starts
+from bricktrack_host.tracking.pose.refine import LedMotion, refine_poses
 from bricktrack_host.tracks import LedObservations
 
 NOISES_PX = (0.02, 0.05, 0.1)

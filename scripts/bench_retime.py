@@ -24,11 +24,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 from daemon_runs import DaemonRun, simulate_run
 
 from bricktrack_common.arrays import FloatArray, rows_of
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.estimate import fuse
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.time_alignment import align_times
-from bricktrack_host.tracking.frame_motion import led_motion
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
+from bricktrack_host.tracking.pose.frame_motion import led_motion
 
 CHOICES = {
     "noise chosen": FusionSettings(),

@@ -38,8 +38,8 @@ from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.estimate import fuse
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.tracking.frame_motion import led_motion
 from bricktrack_host.tracking.optical_track import solve_poses
+from bricktrack_host.tracking.pose.frame_motion import led_motion
 from bricktrack_host.tracks import FusedTrack, OpticalTrack
 
 DROPOUTS = ((3.0, 0.5), (6.0, 0.5))

@@ -27,7 +27,7 @@ from bricktrack_common.arrays import FloatArray  # noqa: E402
 from bricktrack_common.camera_model import IMX219_1080P  # noqa: E402
 from bricktrack_host.evaluation.paper_brick import paper_brick  # noqa: E402
 from bricktrack_host.fusion.estimate import fuse  # noqa: E402
-from bricktrack_host.tracking.led_profile import outline_moments  # noqa: E402
+from bricktrack_host.tracking.led_model.led_profile import outline_moments  # noqa: E402
 
 BLUE, RED, GREEN, AMBER, GREY = "#1f5f8b", "#c8553d", "#588157", "#b7791f", "#6b7280"
 PLANE_A_MM, PLANE_B_MM = 101.117, 161.111

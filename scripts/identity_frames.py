@@ -11,11 +11,11 @@ from bricktrack_common.brick_model import BrickModel, ProfileEntry
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.evaluation.true_camera import TrueCamera
-from bricktrack_host.tracking.correspondence import search_correspondences
-from bricktrack_host.tracking.led_identity import identify_run
-from bricktrack_host.tracking.led_profile import outline_moments
-from bricktrack_host.tracking.run_lights import usual_radius_px
-from bricktrack_host.tracking.segment import Blobs
+from bricktrack_host.tracking.identity.correspondence import search_correspondences
+from bricktrack_host.tracking.identity.led_identity import identify_run
+from bricktrack_host.tracking.led_model.led_profile import outline_moments
+from bricktrack_host.tracking.pictures.run_lights import usual_radius_px
+from bricktrack_host.tracking.pictures.segment import Blobs
 
 COLLAR_MM = 0.7
 N_FALSE = 5

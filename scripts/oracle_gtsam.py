@@ -16,10 +16,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, has_pose
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_samples import seconds_since
-from bricktrack_host.fusion.imu_signal import ImuSignal
-from bricktrack_host.fusion.time_alignment import TimeAlignment, has_pose
+from bricktrack_host.fusion.inertial.imu_samples import seconds_since
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _SAME_INSTANT_S = 1e-6

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import StorageError, VideoError
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.segment import Blobs, Picture, find_blobs
+from bricktrack_host.tracking.pictures.segment import Blobs, Picture, find_blobs
 
 _N_RAYS = 72
 _STEPS_PER_PX = 4

@@ -10,7 +10,7 @@ from bricktrack_common.errors import ConfigError, RunFormatError
 from bricktrack_common.run_folder import read_run
 from bricktrack_host.assemblies.combined_test import read_test
 from bricktrack_host.cli.main import app
-from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE
+from bricktrack_host.fusion.pose_by_pose.moving_camera import NOT_OBSERVABLE
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.daq_clock import fit_edges
 from bricktrack_host.results.result_store import read_result

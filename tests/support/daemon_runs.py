@@ -24,7 +24,7 @@ from bricktrack_device.sim.bno055_chip import Bno055Chip
 from bricktrack_device.sim.imu_signal import ImuSensors, chip_period_s
 from bricktrack_device.sim.settings import HiddenLed, SimImu, SimSettings
 from bricktrack_device.sim.world import SimWorld
-from bricktrack_host.tracking.led_profile import LedPrediction, predict_brick
+from bricktrack_host.tracking.led_model.led_profile import LedPrediction, predict_brick
 from bricktrack_host.tracks import ImuTrack, LedObservations
 
 EPOCH_NS = 50_000_000_000

@@ -16,7 +16,7 @@ from bricktrack_common.brick_model import (
     ProfileEntry,
     brick_model_from_file,
 )
-from bricktrack_host.tracking.segment import Picture
+from bricktrack_host.tracking.pictures.segment import Picture
 
 FloatArray = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.calibration.calibration_file import load_calibration
 from bricktrack_host.tracking.led_tracker import observe_leds
-from bricktrack_host.tracking.segment import Picture
+from bricktrack_host.tracking.pictures.segment import Picture
 from bricktrack_host.tracks import LedObservations
 
 Progress = Callable[[int, int], None]

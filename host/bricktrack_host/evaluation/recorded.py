@@ -11,7 +11,7 @@ from bricktrack_common.errors import ConfigError
 from bricktrack_common.rotations import matrix_from_rvec, nearest_rotation, rvec_from_matrix
 from bricktrack_host.evaluation.scores import SweepScore, score_sweep
 from bricktrack_host.evaluation.sweeps import Sweep
-from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import OpticalTrack
 
 _POSITION, _ROTATION = ("x_mm", "y_mm", "z_mm"), ("rx_deg", "ry_deg", "rz_deg")

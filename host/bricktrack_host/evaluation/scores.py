@@ -8,7 +8,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.evaluation.sweeps import Sweep
-from bricktrack_host.tracking.finite import all_finite
+from bricktrack_host.tracking.pose.finite import all_finite
 
 PAPER_RMS_MM = (0.2296, 0.3943, 0.0703)
 """Of x, y and z over all the paper's sweeps (its section 6.2)."""

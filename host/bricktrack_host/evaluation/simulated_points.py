@@ -14,10 +14,10 @@ from bricktrack_host.evaluation.scores import SweepScore, score_sweep
 from bricktrack_host.evaluation.sweeps import Sweep, paper_sweeps, random_orientations
 from bricktrack_host.evaluation.true_camera import PLANE_A_MM, PLANE_B_MM, TrueCamera
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.correspondence import search_correspondences
+from bricktrack_host.tracking.identity.correspondence import search_correspondences
+from bricktrack_host.tracking.identity.verification import Correspondence
 from bricktrack_host.tracking.optical_track import solve_poses
-from bricktrack_host.tracking.segment import Blobs
-from bricktrack_host.tracking.verification import Correspondence
+from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracks import LedObservations
 
 _MIN_FACING = 0.08  # an LED seen more from the side than this shows too little to be measured

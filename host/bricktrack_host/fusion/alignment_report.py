@@ -8,13 +8,13 @@ from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.fusion.clocks.frame_stamps import StampCheck, check_stamps
+from bricktrack_host.fusion.clocks.rotation_fit import Correlation, correlate
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, align_times, has_pose
 from bricktrack_host.fusion.estimate import FusionResult, fuse
-from bricktrack_host.fusion.frame_stamps import StampCheck, check_stamps
-from bricktrack_host.fusion.imu_samples import seconds_since
-from bricktrack_host.fusion.imu_signal import ImuSignal
+from bricktrack_host.fusion.inertial.imu_samples import seconds_since
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.mount import Mount, refine_mount
-from bricktrack_host.fusion.rotation_fit import Correlation, correlate
-from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times, has_pose
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 

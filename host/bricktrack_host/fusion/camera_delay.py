@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.fusion.fusion_problem import Run
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.moving_camera import CameraMotion
-from bricktrack_host.fusion.noise_choice import frames_log_likelihood
-from bricktrack_host.fusion.time_alignment import TimeAlignment
+from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
+from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraMotion
+from bricktrack_host.fusion.pose_by_pose.noise_choice import frames_log_likelihood
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _UNKNOWN_S = 0.016  # a whole sample's age either way, and the lag of a gyro

@@ -17,22 +17,22 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ConfigError, ShapeError
 from bricktrack_host.fusion.camera_delay import settle_delay
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, align_times
 from bricktrack_host.fusion.contested_frames import with_contested_frames
 from bricktrack_host.fusion.cross_check import CrossCheck
-from bricktrack_host.fusion.fused_output import common_part, sample_motion
-from bricktrack_host.fusion.fusion_problem import Run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.inertial_noise import NoiseLevel
-from bricktrack_host.fusion.moving_camera import (
+from bricktrack_host.fusion.pose_by_pose.fused_output import common_part, sample_motion
+from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
+from bricktrack_host.fusion.pose_by_pose.moving_camera import (
     NOT_OBSERVABLE,
     CameraAlignment,
     CameraImu,
     CameraMotion,
     align_both,
 )
-from bricktrack_host.fusion.pose_level import Smoothed, smooth_poses
-from bricktrack_host.fusion.smoother import BA, BG, GRAV, LAG, LOSS, SKEW, TAU, Estimate
-from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
+from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, smooth_poses
+from bricktrack_host.fusion.smoothing.smoother import BA, BG, GRAV, LAG, LOSS, SKEW, TAU, Estimate
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
 logger = logging.getLogger(__name__)

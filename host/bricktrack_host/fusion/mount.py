@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import matrix_from_quaternion, rvec_from_matrix
-from bricktrack_host.fusion.fusion_problem import Run, first_linearisation
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, align_times, has_pose
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_samples import seconds_since
-from bricktrack_host.fusion.imu_signal import ImuSignal
-from bricktrack_host.fusion.noise_choice import frames_log_likelihood
-from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times, has_pose
+from bricktrack_host.fusion.inertial.imu_samples import seconds_since
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run, first_linearisation
+from bricktrack_host.fusion.pose_by_pose.noise_choice import frames_log_likelihood
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _STEP_MM = 1.5  # of the differences by which the likelihood's curvature is had

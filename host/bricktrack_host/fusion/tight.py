@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment
 from bricktrack_host.fusion.cross_check import CrossCheck, cross_check
 from bricktrack_host.fusion.estimate import FusionInput, FusionResult, fused_result, prepare_run
-from bricktrack_host.fusion.fused_output import sample_motion
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_samples import seconds_since
-from bricktrack_host.fusion.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_smoothing import smooth_leds
-from bricktrack_host.fusion.pose_level import smooth_poses
-from bricktrack_host.fusion.time_alignment import TimeAlignment
+from bricktrack_host.fusion.inertial.imu_samples import seconds_since
+from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
+from bricktrack_host.fusion.led_by_led.led_smoothing import smooth_leds
+from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion
+from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.tracks import ImuTrack, LedObservations, OpticalTrack
 
 logger = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from bricktrack_common.errors import VideoError
 from bricktrack_common.frame_times import FrameTimes
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.recordings.h264_headers import PictureOrder
-from bricktrack_host.tracking.segment import Picture, Plane
+from bricktrack_host.tracking.pictures.segment import Picture, Plane
 
 logger = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from bricktrack_host.transfer.camera_config import AccelerationUnit, CameraTable
 from bricktrack_host.transfer.fleet_config import UnitConfig
 
 if TYPE_CHECKING:
-    from bricktrack_host.fusion.moving_camera import CameraImu
+    from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraImu
 
 _Vector = tuple[float, float, float]
 _SAME_SHAKE_NS = 5_000_000_000  # clocks set by a time server; shakes are minutes apart
@@ -200,7 +200,7 @@ def read_camera_sensor(
     RunFormatError
         If a file cannot be read.
     """
-    from bricktrack_host.fusion.moving_camera import CameraImu
+    from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraImu
 
     if sensor.kind == "table":
         imu = _table_samples(run, sensor, edge_fit, problems)

@@ -9,9 +9,14 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.errors import ConfigError, ShapeError, TrackingError
 from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2, ImuDescription, ImuSamples
 from bricktrack_common.run_folder import Run
-from bricktrack_host.fusion.frame_stamps import check_stamps
-from bricktrack_host.fusion.moving_camera import NOT_OBSERVABLE, CameraAlignment, CameraImu, align_both
-from bricktrack_host.fusion.time_alignment import TimeAlignment, align_times
+from bricktrack_host.fusion.clocks.frame_stamps import check_stamps
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, align_times
+from bricktrack_host.fusion.pose_by_pose.moving_camera import (
+    NOT_OBSERVABLE,
+    CameraAlignment,
+    CameraImu,
+    align_both,
+)
 from bricktrack_host.results.daq_clock import EdgeFit, EdgeFitError, fit_edges
 from bricktrack_host.results.rest_pose import RestPose, tare
 from bricktrack_host.stages.camera_sensor import read_camera_sensor

@@ -9,20 +9,20 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
 from bricktrack_host.fusion.estimate import FusionResult, fuse
-from bricktrack_host.fusion.fused_output import unsure_times
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.imu_samples import BRIDGE_PERIODS, seconds_since
-from bricktrack_host.fusion.imu_signal import ImuSignal
-from bricktrack_host.fusion.inertial_hint import InertialHint
-from bricktrack_host.fusion.optical_smoothing import smooth_optical
+from bricktrack_host.fusion.inertial.imu_samples import BRIDGE_PERIODS, seconds_since
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.fusion.optical.inertial_hint import InertialHint
+from bricktrack_host.fusion.optical.optical_smoothing import smooth_optical
+from bricktrack_host.fusion.pose_by_pose.fused_output import unsure_times
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.results.daq_clock import EdgeFit
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.stages.clocks import Inertial
-from bricktrack_host.tracking.first_poses import FirstPoses
-from bricktrack_host.tracking.frame_motion import led_motion, motion_to_leds, within_exposure_ns
 from bricktrack_host.tracking.optical_track import solve_poses
-from bricktrack_host.tracking.refine import LedMotion
+from bricktrack_host.tracking.pose.first_poses import FirstPoses
+from bricktrack_host.tracking.pose.frame_motion import led_motion, motion_to_leds, within_exposure_ns
+from bricktrack_host.tracking.pose.refine import LedMotion
 from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1

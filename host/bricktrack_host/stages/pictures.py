@@ -12,13 +12,13 @@ from bricktrack_common.frame_times import FrameTimes
 from bricktrack_common.run_folder import Run
 from bricktrack_host.recordings.video_frames import decode_run_video
 from bricktrack_host.stages.progress import ProcessProgress, Silent
-from bricktrack_host.tracking.run_lights import find_run_lights
-from bricktrack_host.tracking.segment import Blobs, Picture, Plane
+from bricktrack_host.tracking.pictures.run_lights import find_run_lights
+from bricktrack_host.tracking.pictures.segment import Blobs, Picture, Plane
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
 if TYPE_CHECKING:
     from bricktrack_host.reporting.plots import FrameOverlay
-    from bricktrack_host.tracking.led_identity import SegmentMethod
+    from bricktrack_host.tracking.identity.led_identity import SegmentMethod
 
 FIND = "decode and find LEDs"
 _N_OVERLAYS = 4

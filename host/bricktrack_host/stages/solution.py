@@ -18,11 +18,11 @@ from bricktrack_host.stages.motion import fuse_run, output_grid, retime, with_un
 from bricktrack_host.stages.progress import Stages
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
-from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_fit import with_profile_of_run
 from bricktrack_host.tracking.odd_leds import with_odd_leds_doubted, words_on_odd_leds
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
+from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors
-from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
+from bricktrack_host.tracking.pictures.light_kernel import FLOOR_SD_PX
 from bricktrack_host.tracks import LedObservations
 
 logger = logging.getLogger(__name__)

@@ -12,12 +12,12 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_rvec
-from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.first_poses import FirstPoses
-from bricktrack_host.tracking.frame_motion import calm_frames, led_times_ns, motion_to_leds
-from bricktrack_host.tracking.led_profile import collar_of, predict_brick
-from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
-from bricktrack_host.tracking.refine import OWN_SHARE, LedMotion
+from bricktrack_host.tracking.led_model.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.pictures.light_kernel import FLOOR_SD_PX
+from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.first_poses import FirstPoses
+from bricktrack_host.tracking.pose.frame_motion import calm_frames, led_times_ns, motion_to_leds
+from bricktrack_host.tracking.pose.refine import OWN_SHARE, LedMotion
 from bricktrack_host.tracks import LedObservations
 
 MIN_LEDS = 5

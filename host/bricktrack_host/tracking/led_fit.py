@@ -13,11 +13,15 @@ from bricktrack_common.arrays import BoolArray, FloatArray, rows_of
 from bricktrack_common.brick_model import DEFAULT_SHIFT_SD_PER_RADIUS, BrickModel, ProfileEntry
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.first_poses import FirstPoses, first_poses
-from bricktrack_host.tracking.frame_motion import calm_frames, carried_px, led_times_ns, motion_to_leds
-from bricktrack_host.tracking.led_profile import UNKNOWN_SHIFT_PER_RADIUS, predict_brick, shift_per_radius
-from bricktrack_host.tracking.refine import OWN_SHARE, RefinedPoses, refine_poses
+from bricktrack_host.tracking.led_model.led_profile import (
+    UNKNOWN_SHIFT_PER_RADIUS,
+    predict_brick,
+    shift_per_radius,
+)
+from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.first_poses import FirstPoses, first_poses
+from bricktrack_host.tracking.pose.frame_motion import calm_frames, carried_px, led_times_ns, motion_to_leds
+from bricktrack_host.tracking.pose.refine import OWN_SHARE, RefinedPoses, refine_poses
 from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
 from bricktrack_host.tracks import LedObservations
 

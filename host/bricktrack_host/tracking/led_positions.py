@@ -15,10 +15,10 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
 from bricktrack_common.rotations import skew
-from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.first_poses import first_poses
-from bricktrack_host.tracking.led_profile import collar_of, predict_brick
-from bricktrack_host.tracking.refine import RefinedPoses, refine_poses
+from bricktrack_host.tracking.led_model.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.first_poses import first_poses
+from bricktrack_host.tracking.pose.refine import RefinedPoses, refine_poses
 from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
 from bricktrack_host.tracks import LedObservations
 

@@ -15,13 +15,13 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.led_identity import SegmentMethod, identify_run
-from bricktrack_host.tracking.led_profile import LedPrediction, collar_of, predict_brick
-from bricktrack_host.tracking.run_identities import Identities
-from bricktrack_host.tracking.run_lights import find_run_lights, usual_radius_px
-from bricktrack_host.tracking.segment import Blobs, Picture
-from bricktrack_host.tracking.verification import MIN_INLIERS
+from bricktrack_host.tracking.identity.led_identity import SegmentMethod, identify_run
+from bricktrack_host.tracking.identity.run_identities import Identities
+from bricktrack_host.tracking.identity.verification import MIN_INLIERS
+from bricktrack_host.tracking.led_model.led_profile import LedPrediction, collar_of, predict_brick
+from bricktrack_host.tracking.pictures.run_lights import find_run_lights, usual_radius_px
+from bricktrack_host.tracking.pictures.segment import Blobs, Picture
+from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import LedObservations
 
 logger = logging.getLogger(__name__)

@@ -16,19 +16,19 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.tracking.finite import all_finite
-from bricktrack_host.tracking.first_poses import FirstPoses, degrees_of_freedom, first_poses
-from bricktrack_host.tracking.frame_motion import (
+from bricktrack_host.tracking.identity.led_identity import SegmentMethod
+from bricktrack_host.tracking.led_fit import OF_THE_SAME_RUN
+from bricktrack_host.tracking.led_model.led_profile import collar_of
+from bricktrack_host.tracking.led_tracker import NOT_USED, observe_leds
+from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.first_poses import FirstPoses, degrees_of_freedom, first_poses
+from bricktrack_host.tracking.pose.frame_motion import (
     led_times_ns,
     motion_doubt_px2,
     motion_to_leds,
 )
-from bricktrack_host.tracking.led_fit import OF_THE_SAME_RUN
-from bricktrack_host.tracking.led_identity import SegmentMethod
-from bricktrack_host.tracking.led_profile import collar_of
-from bricktrack_host.tracking.led_tracker import NOT_USED, observe_leds
-from bricktrack_host.tracking.prsoi import PrsoiForm, prsoi_starts
-from bricktrack_host.tracking.refine import MIN_LEDS, LedMotion, RefinedPoses, refine_poses
+from bricktrack_host.tracking.pose.prsoi import PrsoiForm, prsoi_starts
+from bricktrack_host.tracking.pose.refine import MIN_LEDS, LedMotion, RefinedPoses, refine_poses
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
 __all__ = ["SegmentMethod", "led_times_ns", "observe_leds", "solve_poses", "start_poses"]

@@ -6,8 +6,8 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, rows_of
 from bricktrack_common.errors import CalibrationError
-from bricktrack_host.tracking.finite import all_finite
 from bricktrack_host.tracking.led_tracker import NOT_USED
+from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import LedObservations
 
 

@@ -10,7 +10,7 @@ from fusion_samples import REPOSITORY, bench_module
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.fusion.time_alignment import align_times
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 
 RATE_HZ = 100.0
 

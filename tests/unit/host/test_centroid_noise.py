@@ -8,9 +8,9 @@ from pinhole import PinholeCamera
 from bricktrack_common.brick_model import ProfileEntry
 from bricktrack_host.tracking.centroid_noise import measure_noise, with_measured_noise
 from bricktrack_host.tracking.frame_errors import frame_errors
-from bricktrack_host.tracking.led_profile import predict_brick
-from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
+from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
+from bricktrack_host.tracking.pictures.light_kernel import FLOOR_SD_PX
 from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from led_scenes import draw_disc, luma_of_light
 
-from bricktrack_host.tracking.centroids import light_levels, measure_spot
-from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
+from bricktrack_host.tracking.pictures.centroids import light_levels, measure_spot
+from bricktrack_host.tracking.pictures.light_kernel import FLOOR_SD_PX
 
 # Codes are whole numbers and Rec. 709's curve is steep: over a rim of 200 pixels that leaves some 0.003 px.
 QUANTISED_PX = 0.01

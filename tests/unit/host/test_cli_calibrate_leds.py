@@ -15,7 +15,7 @@ from bricktrack_common.errors import ConfigError
 from bricktrack_host import pipeline
 from bricktrack_host.calibration import calibration_file
 from bricktrack_host.cli.calibrate_leds import leds
-from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()

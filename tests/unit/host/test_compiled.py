@@ -17,21 +17,21 @@ def names_behind(source):
 
 
 def test_code_is_kept_for_what_a_module_imports_however_indirectly():
-    behind = names_behind(TRACKING / "refine_kernel.py")
-    assert "tracking/led_view.py" in behind
+    behind = names_behind(TRACKING / "pose" / "refine_kernel.py")
+    assert "led_model/led_view.py" in behind
     assert "bricktrack_host/compiled.py" in behind
-    assert "tracking/light_kernel.py" not in behind
+    assert "pictures/light_kernel.py" not in behind
     # A module taken from a package by name, and what that imports in its turn.
-    assert "tracking/light_kernel.py" in names_behind(TRACKING / "segment.py")
+    assert "pictures/light_kernel.py" in names_behind(TRACKING / "pictures" / "segment.py")
 
 
-@pytest.mark.parametrize("line", ["from bricktrack_host.tracking import finite, light_kernel as k",
-                                  "from bricktrack_host.tracking import (\n    finite,\n    light_kernel as k,\n)"])  # fmt: skip
+@pytest.mark.parametrize("line", ["from bricktrack_host.tracking.pose import finite, p3p as k",
+                                  "from bricktrack_host.tracking.pose import (\n    finite,\n    p3p as k,\n)"])  # fmt: skip
 def test_all_names_of_an_import_are_followed(tmp_path, line):
     source = tmp_path / "a.py"
     source.write_text(f"{line}\n")
     behind = {path.name for path in sources_behind(source)}
-    assert {"a.py", "finite.py", "light_kernel.py"} <= behind
+    assert {"a.py", "finite.py", "p3p.py"} <= behind
 
 
 def test_a_changed_source_is_compiled_in_a_folder_of_its_own(tmp_path, monkeypatch):

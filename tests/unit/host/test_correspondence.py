@@ -6,9 +6,13 @@ from led_scenes import leds_in_camera, random_poses, seven_leds
 from pinhole import PinholeCamera
 
 from bricktrack_common.brick_model import LayoutFile, LedEntry, brick_model_from_file
-from bricktrack_host.tracking.correspondence import search_correspondence
-from bricktrack_host.tracking.paper_rules import identify_by_paper, is_paper_layout, paper_correspondence
-from bricktrack_host.tracking.segment import Blobs
+from bricktrack_host.tracking.identity.correspondence import search_correspondence
+from bricktrack_host.tracking.identity.paper_rules import (
+    identify_by_paper,
+    is_paper_layout,
+    paper_correspondence,
+)
+from bricktrack_host.tracking.pictures.segment import Blobs
 
 CAMERA = PinholeCamera()
 BRICK = seven_leds()

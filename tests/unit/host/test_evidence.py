@@ -1,6 +1,6 @@
 import numpy as np
 
-from bricktrack_host.tracking.evidence import evidence_of
+from bricktrack_host.tracking.identity.evidence import evidence_of
 
 N_PIXELS = 1920 * 1080
 AREA = 3000.0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from brick_shakes import simulate_shake
 
-from bricktrack_host.fusion.frame_stamps import check_stamps, offset_change
-from bricktrack_host.fusion.fused_output import unsure_times
-from bricktrack_host.fusion.stamp_regularity import stamp_regularity
-from bricktrack_host.fusion.time_alignment import align_times
+from bricktrack_host.fusion.clocks.frame_stamps import check_stamps, offset_change
+from bricktrack_host.fusion.clocks.stamp_regularity import stamp_regularity
+from bricktrack_host.fusion.clocks.time_alignment import align_times
+from bricktrack_host.fusion.pose_by_pose.fused_output import unsure_times
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.stages.motion import with_unsure_times
 from bricktrack_host.tracks import FusedTrack

@@ -7,9 +7,9 @@ import pytest
 from daemon_runs import simulate_run
 
 from bricktrack_host.fusion.estimate import FusionInput, prepare_run
-from bricktrack_host.fusion.fused_output import sample_motion
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.pose_level import smooth_poses
+from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion
+from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracking.optical_track import solve_poses
 

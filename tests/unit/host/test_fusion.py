@@ -10,9 +10,9 @@ from brick_shakes import EPOCH_NS, LEVER_ARM_MM, simulate_shake
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import ConfigError, ShapeError, TrackingError
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.estimate import FusionInput, fuse, fuse_batch
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.time_alignment import align_times
 from bricktrack_host.quality import PoseFlag
 
 DROPOUTS = ((2.0, 2.35), (4.0, 4.2))

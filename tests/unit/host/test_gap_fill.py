@@ -5,10 +5,10 @@ import pytest
 from brick_shakes import EPOCH_NS, LEVER_ARM_MM, simulate_shake
 from scipy.spatial.transform import Rotation
 
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.estimate import fuse
-from bricktrack_host.fusion.gap_fill import fill_of_gaps
-from bricktrack_host.fusion.imu_samples import clean_samples
-from bricktrack_host.fusion.time_alignment import align_times
+from bricktrack_host.fusion.inertial.imu_samples import clean_samples
+from bricktrack_host.fusion.pose_by_pose.gap_fill import fill_of_gaps
 from bricktrack_host.quality import PoseFlag
 
 GAP_S = (2.5, 3.3)

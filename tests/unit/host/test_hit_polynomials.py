@@ -5,7 +5,7 @@ import pytest
 from pinhole import PinholeCamera
 
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.tracking.hit_polynomials import expand_at, hit_polynomials
+from bricktrack_host.tracking.led_model.hit_polynomials import expand_at, hit_polynomials
 
 CAMERA = PinholeCamera()
 

@@ -7,7 +7,7 @@ import pytest
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.evaluation.paper_brick import paper_brick
 from bricktrack_host.evaluation.true_camera import TrueCamera
-from bricktrack_host.tracking.identity_motion import poses_between, turn_between, unknown_motion
+from bricktrack_host.tracking.identity.identity_motion import poses_between, turn_between, unknown_motion
 
 STEP_NS = 33_327_000
 

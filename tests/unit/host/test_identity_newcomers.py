@@ -6,11 +6,11 @@ from led_scenes import seven_leds
 from pinhole import PinholeCamera
 
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
-from bricktrack_host.tracking.identity_newcomers import leave_out_newcomers, log_odds
-from bricktrack_host.tracking.identity_smoothing import steady_poses
-from bricktrack_host.tracking.led_profile import predict_brick
-from bricktrack_host.tracking.run_identities import RunIdentities
-from bricktrack_host.tracking.segment import Blobs
+from bricktrack_host.tracking.identity.identity_newcomers import leave_out_newcomers, log_odds
+from bricktrack_host.tracking.identity.identity_smoothing import steady_poses
+from bricktrack_host.tracking.identity.run_identities import RunIdentities
+from bricktrack_host.tracking.led_model.led_profile import predict_brick
+from bricktrack_host.tracking.pictures.segment import Blobs
 
 CAMERA = PinholeCamera()
 COLLAR = 0.7

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import ImuFlag
-from bricktrack_host.fusion.imu_signal import ImuSignal, chain_rotations, roughness
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal, chain_rotations, roughness
 from bricktrack_host.tracks import ImuTrack
 
 EPOCH_NS = 5_000_000_000_000

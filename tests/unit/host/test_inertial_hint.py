@@ -5,9 +5,9 @@ from brick_shakes import EPOCH_NS, simulate_shake
 from scipy.spatial.transform import Rotation
 from two_imus import simulate_two_imus
 
-from bricktrack_host.fusion.inertial_hint import InertialHint
-from bricktrack_host.fusion.optical_smoothing import smooth_optical
-from bricktrack_host.fusion.time_alignment import align_times
+from bricktrack_host.fusion.clocks.time_alignment import align_times
+from bricktrack_host.fusion.optical.inertial_hint import InertialHint
+from bricktrack_host.fusion.optical.optical_smoothing import smooth_optical
 from bricktrack_host.quality import PoseFlag
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from two_imus import simulate_two_imus
 
-from bricktrack_host.fusion.attitude import mean_rate
-from bricktrack_host.fusion.joint_alignment import align_jointly
-from bricktrack_host.fusion.time_alignment import TimeAlignment
+from bricktrack_host.fusion.clocks.joint_alignment import align_jointly
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment
+from bricktrack_host.fusion.inertial.attitude import mean_rate
 
 BRICK_MS, CAMERA_MS = 4.0, 6.5
 

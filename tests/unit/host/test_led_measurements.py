@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bricktrack_host.fusion.led_measurements import led_chi2
+from bricktrack_host.fusion.led_by_led.led_measurements import led_chi2
 
 
 def chi2_of(cov_px2, of_state_px2, *, use=True):

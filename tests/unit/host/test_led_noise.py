@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.inertial_noise import NoiseLevel
-from bricktrack_host.fusion.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_noise import (
+from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
+from bricktrack_host.fusion.led_by_led.led_noise import (
     STATED_SCALES,
     InertialNoise,
     centroid_scales,
     still_sightings,
 )
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
 
 
 def sightings(frame, led, u_px):

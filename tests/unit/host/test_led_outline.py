@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from pinhole import PinholeCamera
 
-from bricktrack_host.tracking.led_outline import LARGEST_SIZE, LARGEST_TANGENT, outlines_of
-from bricktrack_host.tracking.led_profile import outline_moments, predict_leds
+from bricktrack_host.tracking.led_model.led_outline import LARGEST_SIZE, LARGEST_TANGENT, outlines_of
+from bricktrack_host.tracking.led_model.led_profile import outline_moments, predict_leds
 
 CAMERA = PinholeCamera()  # 1560 px: 12 px/mm at 130 mm
 RADIUS_MM = 3.0

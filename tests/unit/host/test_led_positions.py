@@ -6,8 +6,8 @@ from led_scenes import random_poses, seven_leds
 from pinhole import PinholeCamera
 
 from bricktrack_common.errors import CalibrationError
+from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.led_positions import fit_positions, free_directions
-from bricktrack_host.tracking.led_profile import predict_brick
 from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()

@@ -4,7 +4,7 @@ from led_scenes import lit_outline, polygon_centroid, random_poses, seven_leds
 from pinhole import PinholeCamera
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.tracking.led_profile import outline_moments, predict_brick, predict_leds
+from bricktrack_host.tracking.led_model.led_profile import outline_moments, predict_brick, predict_leds
 
 CAMERA = PinholeCamera()
 FAR_MM = 1e9

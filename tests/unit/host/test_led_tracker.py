@@ -11,7 +11,7 @@ from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.tracking import led_tracker
 from bricktrack_host.tracking.led_tracker import observe_leds
 from bricktrack_host.tracking.optical_track import solve_poses
-from bricktrack_host.tracking.run_lights import usual_radius_px
+from bricktrack_host.tracking.pictures.run_lights import usual_radius_px
 from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()

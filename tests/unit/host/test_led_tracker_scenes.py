@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.tracking.led_tracker import NOT_USED, observe_leds
 from bricktrack_host.tracking.optical_track import solve_poses
-from bricktrack_host.tracking.segment import Picture
+from bricktrack_host.tracking.pictures.segment import Picture
 
 CAMERA = PinholeCamera()
 COLLAR = 0.7

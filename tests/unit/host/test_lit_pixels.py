@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bricktrack_host.tracking.centroids import flat_bytes
-from bricktrack_host.tracking.lit_pixels import LIT, OWN, light_near, near_others, widened
+from bricktrack_host.tracking.pictures.centroids import flat_bytes
+from bricktrack_host.tracking.pictures.lit_pixels import LIT, OWN, light_near, near_others, widened
 
 CUT = np.uint8(100)
 Picture = NDArray[np.uint8]

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from bricktrack_common.errors import VideoError
-from bricktrack_host.tracking.look_ahead import look_ahead
+from bricktrack_host.tracking.pictures.look_ahead import look_ahead
 
 
 def test_items_come_in_order_and_all():

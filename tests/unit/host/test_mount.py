@@ -8,8 +8,8 @@ from brick_shakes import LEVER_ARM_MM, simulate_shake
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import TrackingError
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.mount import check_chip_orientation, refine_mount
-from bricktrack_host.fusion.time_alignment import align_times
 
 
 def turned(imu, rvec):

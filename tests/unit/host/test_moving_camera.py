@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from two_imus import IMU_TO_CAMERA_MM, simulate_two_imus
 
 from bricktrack_common.errors import ConfigError
-from bricktrack_host.fusion.attitude import mean_rate
 from bricktrack_host.fusion.estimate import fuse
-from bricktrack_host.fusion.imu_signal import ImuSignal
-from bricktrack_host.fusion.moving_camera import CameraImu, closing_bias
+from bricktrack_host.fusion.inertial.attitude import mean_rate
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraImu, closing_bias
 from bricktrack_host.tracks import ImuTrack
 
 DROPOUTS = ((2.0, 2.4), (3.6, 3.9))

@@ -9,10 +9,10 @@ from bricktrack_common.brick_model import ProfileEntry
 from bricktrack_host.quality import LedFlag
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.frame_errors import frame_errors
-from bricktrack_host.tracking.led_profile import predict_brick
-from bricktrack_host.tracking.light_kernel import FLOOR_SD_PX
+from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.odd_leds import odd_leds_px, with_odd_leds_doubted, words_on_odd_leds
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
+from bricktrack_host.tracking.pictures.light_kernel import FLOOR_SD_PX
 from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()

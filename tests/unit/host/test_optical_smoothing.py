@@ -8,7 +8,7 @@ from brick_shakes import EPOCH_NS, simulate_shake
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import ShapeError, TrackingError
-from bricktrack_host.fusion.optical_smoothing import OpticalSmoothingSettings, smooth_optical
+from bricktrack_host.fusion.optical.optical_smoothing import OpticalSmoothingSettings, smooth_optical
 from bricktrack_host.quality import PoseFlag
 
 WHITE = OpticalSmoothingSettings(optical_common_share=0.0)  # the simulated noise has nothing in common

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from bricktrack_common.brick_model import LayoutFile, LedEntry, ProfileEntry, brick_model_from_file
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
-from bricktrack_host.tracking.frame_motion import led_motion, led_times_ns, within_exposure_ns
-from bricktrack_host.tracking.led_profile import predict_brick
+from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
+from bricktrack_host.tracking.pose.frame_motion import led_motion, led_times_ns, within_exposure_ns
 from bricktrack_host.tracks import FusedTrack, LedObservations
 
 CAMERA = PinholeCamera()

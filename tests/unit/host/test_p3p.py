@@ -2,7 +2,7 @@ import numpy as np
 from pinhole import PinholeCamera
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.tracking.p3p import ray_centre_mm, rays_of, solve_p3p
+from bricktrack_host.tracking.pose.p3p import ray_centre_mm, rays_of, solve_p3p
 
 
 def test_one_of_the_poses_is_the_true_one():

@@ -1,7 +1,7 @@
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from bricktrack_host.tracking.pattern import NOT_FOLLOWED, assign_predicted, follow_pattern
+from bricktrack_host.tracking.identity.pattern import NOT_FOLLOWED, assign_predicted, follow_pattern
 
 PATTERN = np.array(
     [[900.0, 300.0], [1150.0, 340.0], [1450.0, 440.0], [900.0, 450.0], [905.0, 560.0], [910.0, 790.0], [1480.0, 820.0]]

@@ -4,8 +4,8 @@ from led_scenes import leds_in_camera, random_poses, seven_leds
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import ShapeError
-from bricktrack_host.tracking import prsoi
-from bricktrack_host.tracking.prsoi import prsoi_poses
+from bricktrack_host.tracking.pose import prsoi
+from bricktrack_host.tracking.pose.prsoi import prsoi_poses
 
 A_MM, B_MM = 101.117, 161.111
 BRICK = seven_leds()

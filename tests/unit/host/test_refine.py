@@ -7,8 +7,8 @@ from pinhole import PinholeCamera
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.tracking.prsoi import prsoi_starts
-from bricktrack_host.tracking.refine import LedMotion, refine_poses
+from bricktrack_host.tracking.pose.prsoi import prsoi_starts
+from bricktrack_host.tracking.pose.refine import LedMotion, refine_poses
 
 CAMERA = PinholeCamera()
 SD_PX = 0.06

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from daemon_runs import simulate_run
 
-from bricktrack_host.fusion.time_alignment import align_times
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.stages.clocks import Inertial
 from bricktrack_host.stages.motion import retime
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses

@@ -10,8 +10,8 @@ from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_device.sim.bno055_chip import START_S
 from bricktrack_device.sim.imu_signal import chip_period_s
-from bricktrack_host.fusion.sample_clock import SampleClock
-from bricktrack_host.fusion.time_alignment import align_times
+from bricktrack_host.fusion.clocks.sample_clock import SampleClock
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.tracking.optical_track import solve_poses
 
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from bricktrack_host.fusion.saw_tooth_kernel import grid_cost, optics_cost
+from bricktrack_host.fusion.clocks.saw_tooth_kernel import grid_cost, optics_cost
 
 
 def test_a_saw_tooth_costs_what_its_ages_cost_in_every_stretch_of_time():

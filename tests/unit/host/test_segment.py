@@ -4,7 +4,7 @@ from led_scenes import draw_disc, picture_of_light
 
 from bricktrack_common.errors import ShapeError
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.segment import PaperLimits, Picture, find_blobs, paper_filter
+from bricktrack_host.tracking.pictures.segment import PaperLimits, Picture, find_blobs, paper_filter
 
 CENTRES = np.array([[300.3, 250.8], [700.6, 300.1], [1200.2, 700.7], [1700.9, 900.4]])
 

@@ -8,11 +8,15 @@ from brick_shakes import LEVER_ARM_MM, simulate_shake
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.estimate import FusionInput, fuse, prepare_run
-from bricktrack_host.fusion.fusion_problem import build_problem, first_linearisation, place_nodes
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.inertial_noise import NoiseLevel
-from bricktrack_host.fusion.sensor_errors import SensorErrors, estimate_sensor_errors, with_sensor_doubt
-from bricktrack_host.fusion.smoother import POS, SEEN, Filter
+from bricktrack_host.fusion.pose_by_pose.fusion_problem import build_problem, first_linearisation, place_nodes
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
+from bricktrack_host.fusion.smoothing.sensor_errors import (
+    SensorErrors,
+    estimate_sensor_errors,
+    with_sensor_doubt,
+)
+from bricktrack_host.fusion.smoothing.smoother import POS, SEEN, Filter
 from bricktrack_host.quality import PoseFlag
 
 GYRO = np.array([[0.012, -0.004, 0.006], [0.003, -0.015, 0.002], [-0.005, 0.004, 0.010]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.fusion.smoother import (
+from bricktrack_host.fusion.smoothing.smoother import (
     ATT,
     BA,
     BG,

@@ -7,9 +7,9 @@ import pytest
 from brick_shakes import LEVER_ARM_MM, simulate_shake
 from scipy.spatial.transform import Rotation
 
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.cross_check import cross_check
 from bricktrack_host.fusion.estimate import fuse
-from bricktrack_host.fusion.time_alignment import align_times
 from bricktrack_host.stages.clocks import ChipOrientation, Inertial
 from bricktrack_host.stages.details import alignment_details
 

@@ -7,14 +7,14 @@ import pytest
 from daemon_runs import simulate_run
 
 from bricktrack_common.brick_model import ProfileEntry
-from bricktrack_host.fusion import led_smoothing
 from bricktrack_host.fusion.estimate import FusionInput, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_smoothing import smooth_leds
-from bricktrack_host.fusion.pose_level import smooth_poses
-from bricktrack_host.fusion.smoother import POS, Filter
-from bricktrack_host.fusion.standing_errors import StandingWay
+from bricktrack_host.fusion.led_by_led import led_smoothing
+from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
+from bricktrack_host.fusion.led_by_led.led_smoothing import smooth_leds
+from bricktrack_host.fusion.led_by_led.standing_errors import StandingWay
+from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
+from bricktrack_host.fusion.smoothing.smoother import POS, Filter
 from bricktrack_host.tracking.optical_track import solve_poses
 
 SETTINGS = FusionSettings()

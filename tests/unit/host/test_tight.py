@@ -7,9 +7,9 @@ import pytest
 from daemon_runs import simulate_run
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.fusion.led_measurements import SeenLeds
-from bricktrack_host.fusion.observation_kernel import LedArrays, observation_room, place_led
-from bricktrack_host.fusion.smoother import ATT, N_STATES, POS, VEL
+from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
+from bricktrack_host.fusion.smoothing.observation_kernel import LedArrays, observation_room, place_led
+from bricktrack_host.fusion.smoothing.smoother import ATT, N_STATES, POS, VEL
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.tracking.optical_track import solve_poses
 

@@ -9,7 +9,7 @@ import pytest
 from brick_shakes import simulate_shake
 
 from bricktrack_common.errors import ConfigError, TrackingError
-from bricktrack_host.fusion.time_alignment import align_times
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bricktrack_host.fusion.imu_signal import ImuSignal, roughness
-from bricktrack_host.fusion.vibration import (
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal, roughness
+from bricktrack_host.fusion.inertial.vibration import (
     fill,
     interpolation_error,
     mend_vibration,

@@ -1,0 +1,1 @@
+"""Which instant a sample and a frame belong to: offset, skew, delays and slips."""

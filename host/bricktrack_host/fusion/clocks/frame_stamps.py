@@ -1,0 +1,252 @@
+"""Whether the frames' stamps can be right, by the camera's steady rate and by the inertial samples.
+
+Stamps that step or scatter were made elsewhere, or edited, or the camera paused: where the brick turned on
+both sides, the inertial samples tell which.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
+from bricktrack_host.fusion.clocks.stamp_regularity import (
+    JITTER_NS,
+    MIN_FRAMES,
+    StampRegularity,
+    StampStep,
+    stamp_regularity,
+)
+from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
+from bricktrack_host.fusion.inertial.imu_samples import seconds_since
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.tracks import ImuTrack, OpticalTrack
+
+_WINDOW_S = 3.0  # of motion on either side of a step
+_CLOCK_RATE_SD = 1e-4  # of two crystals against each other
+_FREE_RATE_SD = 5e-3  # of a sensor's own clock, which a step may have falsified
+_FLOOR_S = 0.3e-3  # to which two fits of one offset agree, with all that their sd leave out
+_SIGMA = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetChange:
+    """By how much the offset of IMU and camera differs between two stretches of a run, s, by rotations."""
+
+    change_s: float
+    sd_s: float
+
+
+def offset_change(
+    optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, *, split_ns: int, from_ns: int, to_ns: int
+) -> OffsetChange | None:
+    """Return by how much the offset of IMU and camera changes at an instant, by the rotations on both sides.
+
+    Parameters
+    ----------
+    optical : OpticalTrack
+    imu : ImuTrack
+        In brick axes.
+    alignment : TimeAlignment
+        Of the whole run.
+    split_ns, from_ns, to_ns : int, ns, camera time
+        The instant, and what to look at around it.
+
+    Returns
+    -------
+    change : OffsetChange or None
+        Later less earlier, s; None where the run has no offset by its motion, or one side turns too little.
+    """
+    if alignment.source != "data":
+        return None
+    # The skew of the whole run has taken up most of any step: each side begins without.
+    alignment = replace(alignment, skew=0.0)
+    clock = alignment.sample_clock
+    signal = ImuSignal.from_track(
+        imu if clock is None else clock.restamp(imu), gyro_filter_s=alignment.gyro_filter_s
+    )
+    seen = has_pose(optical) & (optical.t_ns >= from_ns) & (optical.t_ns <= to_ns)
+    is_after = optical.t_ns >= split_ns
+    earlier = _offset(optical, alignment, signal, seen & ~is_after)
+    later = _offset(optical, alignment, signal, seen & is_after)
+    if earlier is None or later is None:
+        return None
+    change_s, variance_s2 = 0.0, _FLOOR_S**2
+    split_s = float(seconds_since(alignment.imu_time_ns(np.array([split_ns])), signal.epoch_ns)[0])
+    for sign, (fit, mid_s) in ((-1.0, earlier), (1.0, later)):
+        # Each side's own rate carries it to the split.
+        at_split = np.array([1.0, split_s - mid_s])
+        change_s += sign * float(at_split @ [fit.offset_s, fit.skew])
+        variance_s2 += float(at_split @ fit.covariance[:2, :2] @ at_split)
+    return OffsetChange(change_s, float(np.sqrt(variance_s2)))
+
+
+def _offset(
+    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray
+) -> tuple[Fit, float] | None:
+    """Return what some frames say of the offset beyond the alignment's, and the middle of their times."""
+    if not frames.any():
+        return None
+    # In IMU time by the alignment: what is left to find is zero where it holds.
+    t_s = seconds_since(alignment.imu_time_ns(optical.t_ns[frames]), signal.epoch_ns)
+    sd_rad = np.sqrt(np.trace(optical.covariance[frames][:, :3, :3], axis1=1, axis2=2) / 3)
+    solver = RotationFit(
+        t_s,
+        optical.R_camera_brick[frames],
+        np.maximum(sd_rad, MIN_ROTATION_SD_RAD),
+        signal,
+        skew_prior_sd=_CLOCK_RATE_SD if alignment.sample_clock is None else _FREE_RATE_SD,
+    )
+    fit = solver.solve(0.0)
+    return None if fit is None else (fit, float(0.5 * (t_s[0] + t_s[-1])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StampCheck:
+    """What can be said against the frames' stamps.
+
+    Attributes
+    ----------
+    regularity : StampRegularity
+    sd_ns : ndarray, shape (n_frames,), ns
+        How unsure the instant of each frame is for it; zero where nothing speaks against the stamps.
+    problems : tuple of str
+        In words.
+    is_contradicted : bool
+        Whether the motion says that they are wrong somewhere, or those of the inertial samples.
+    """
+
+    regularity: StampRegularity
+    sd_ns: FloatArray
+    problems: tuple[str, ...]
+    is_contradicted: bool
+
+
+def check_stamps(
+    stamps_ns: IntArray, optical: OpticalTrack, imu: ImuTrack | None, alignment: TimeAlignment | None
+) -> StampCheck:
+    """Return what the camera's steady rate and the inertial samples say against the frames' stamps.
+
+    Which side of a step is wrong nothing tells, so all frames of the run are unsure by it; unless the motion
+    says that the camera paused and the stamps are right.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int64, shape (n_frames,), ns, rising
+        Of the frames of ``optical``.
+    optical : OpticalTrack
+    imu, alignment : ImuTrack and TimeAlignment, or None
+        Without them the rate alone is looked at.
+    """
+    regularity = stamp_regularity(stamps_ns)
+    problems = _words_on_rate(regularity)
+    sd_ns = np.hypot(regularity.stray_ns, regularity.jitter_ns if regularity.jitter_ns > JITTER_NS else 0.0)
+    is_contradicted, level, levels_ns = False, 0.0, [0.0]
+    ends = [0, *(s.frame for s in regularity.steps), len(stamps_ns)]
+    for i, step in enumerate(regularity.steps, start=1):
+        split_ns = int(optical.t_ns[step.frame])
+        change = None
+        if imu is not None and alignment is not None:
+            change = offset_change(
+                optical, imu, alignment, split_ns=split_ns,
+                from_ns=max(int(optical.t_ns[ends[i - 1]]), split_ns - round(_WINDOW_S * 1e9)),
+                to_ns=min(int(optical.t_ns[ends[i + 1] - 1]), split_ns + round(_WINDOW_S * 1e9)),
+            )  # fmt: skip
+        verdict = _verdict(step, change)
+        is_contradicted |= verdict == "stamps"
+        if verdict != "paused":
+            level += step.size_ns
+            levels_ns.append(level)
+        problems.append(_step_words(step, regularity.period_ns, change, verdict))
+    spread_ns = max(levels_ns) - min(levels_ns)
+    if not regularity.steps and imu is not None and alignment is not None:
+        change = _change_of_halves(optical, imu, alignment)
+        if change is not None and abs(change.change_s) > _SIGMA * change.sd_s:
+            is_contradicted, spread_ns = True, abs(change.change_s) * 1e9
+            problems.append(
+                "the offset of IMU and camera changes by "
+                f"{change.change_s * 1e3:+.1f} +- {change.sd_s * 1e3:.1g} ms from the first half of the run "
+                "to the second, by the rotations that both saw: the stamps of one of them step or drift. "
+                "Poses are as unsure as the motion in that time"
+            )
+        elif alignment.source == "data" and abs(alignment.skew) > _SIGMA * np.hypot(
+            alignment.skew_sd, _CLOCK_RATE_SD
+        ):
+            span_ns = float(optical.t_ns[-1] - optical.t_ns[0])
+            is_contradicted, spread_ns = True, 0.5 * abs(alignment.skew) * span_ns
+            problems.append(
+                f"the clocks of IMU and camera run apart by {alignment.skew * 1e6:.0f} ppm, by the rotations "
+                "that both saw, where crystals hold 100: one of the two is scaled. Poses are as unsure as "
+                f"the motion in the {spread_ns / 1e6:.1f} ms that come together to either end of the run"
+            )
+    return StampCheck(regularity, np.hypot(sd_ns, spread_ns), tuple(problems), is_contradicted)
+
+
+def _words_on_rate(regularity: StampRegularity) -> list[str]:
+    """Return what the stamps alone say against themselves, steps left out."""
+    problems: list[str] = []
+    period_ms = regularity.period_ns / 1e6
+    if not regularity.is_steady and len(regularity.stray_ns) >= MIN_FRAMES:
+        problems.append(
+            f"frame stamps: the intervals vary from {regularity.shortest_ns / 1e6:.2f} to "
+            f"{regularity.longest_ns / 1e6:.2f} ms (median {period_ms:.2f} ms), so the stamps cannot be "
+            "checked against a steady rate. Fix the camera's frame rate"
+        )
+    if regularity.jitter_ns > JITTER_NS:
+        problems.append(
+            f"frame stamps scatter by {regularity.jitter_ns / 1e6:.2g} ms (sd) about a steady period of "
+            f"{period_ms:.3f} ms: they were made late or rounded, or the camera is not free-running. Poses "
+            "are as unsure as the motion in that time"
+        )
+    strays = np.flatnonzero(regularity.stray_ns)
+    if strays.size:
+        worst = int(strays[np.argmax(np.abs(regularity.stray_ns[strays]))])
+        problems.append(
+            f"{strays.size} frame stamp{'' if strays.size == 1 else 's'} off a steady period of "
+            f"{period_ms:.3f} ms, most that of frame {worst} by {regularity.stray_ns[worst] / 1e6:+.2f} ms: "
+            "poses there are as unsure as the motion in that time"
+        )
+    return problems
+
+
+def _verdict(step: StampStep, change: OffsetChange | None) -> Literal["stamps", "paused", "unknown"]:
+    """Return what the motion says of a step: the stamps are wrong, the camera paused, or nothing."""
+    if change is None:
+        return "unknown"
+    if abs(change.change_s) > _SIGMA * change.sd_s:
+        return "stamps"
+    # Stamps that step up make the offset step down.
+    excluded = abs(change.change_s + step.size_ns * 1e-9) > _SIGMA * change.sd_s
+    return "paused" if excluded else "unknown"
+
+
+def _step_words(
+    step: StampStep,
+    period_ns: float,
+    change: OffsetChange | None,
+    verdict: Literal["stamps", "paused", "unknown"],
+) -> str:
+    found = (
+        f"frame stamps step by {step.size_ns / 1e6:+.2f} ms between frames {step.frame - 1} and "
+        f"{step.frame}: {step.interval_ns / 1e6:.2f} ms is {step.interval_ns / period_ns:.2f} periods of a "
+        f"steady {period_ns / 1e6:.3f} ms"
+    )
+    doubt = "Poses of the whole run are as unsure as the motion in that time"
+    if change is None:
+        return f"{found}. The motion does not tell whether the camera paused or the stamps are wrong. {doubt}"
+    size = f"{change.change_s * 1e3:+.1f} +- {change.sd_s * 1e3:.1g} ms"
+    moved = f"offset of IMU and camera changes there by {size}"
+    if verdict == "paused":
+        return f"{found}. The {moved}: the camera paused, and the stamps are believed"
+    if verdict == "stamps":
+        return f"{found}, and the {moved}: the stamps are wrong before it or after. {doubt}"
+    return f"{found}. The {moved}, too unsure to tell whether the stamps are wrong. {doubt}"
+
+
+def _change_of_halves(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> OffsetChange | None:
+    t_ns = optical.t_ns[has_pose(optical)]
+    return offset_change(
+        optical, imu, alignment,
+        split_ns=int(t_ns[len(t_ns) // 2]), from_ns=int(t_ns[0]), to_ns=int(t_ns[-1]),
+    )  # fmt: skip

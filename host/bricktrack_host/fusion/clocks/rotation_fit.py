@@ -1,0 +1,232 @@
+"""Offset of two clocks from one rotation that both saw: correlation, then least squares.
+
+The coarse offset comes from the angular rates, the fine one from optical attitudes against the integrated
+gyro.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.fusion.clocks.rotation_fit_kernel import (
+    compare_with_gyro,
+    drift_of,
+    integrated_attitudes,
+    normal_equations,
+)
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+
+MIN_POSES = 20
+GRID_S = 0.004  # of the cross-correlation
+_NODE_S = 0.0025  # of the integrated gyro
+_KNOT_S = 0.5  # of the slow drift between integrated gyro and optics: its noise, bias and scale error
+_AMBIGUOUS_SIGMA = 5.0
+_MISFIT_CAP = 25.0
+LOSS_PRIOR_SD_S2 = 2e-5  # of c: 4.5 ms squared, the BNO055's narrower settings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """One least-squares fit: offset and skew with covariance, gyro bias, and how well the attitudes agree.
+
+    ``misfit`` is the sum of squares behind ``residual_sd``, in which no frame counts more than `_MISFIT_CAP`
+    times what it should.
+    """
+
+    offset_s: float
+    skew: float
+    loss_s2: float
+    bias_radps: FloatArray
+    bias_sd_radps: FloatArray
+    covariance: FloatArray
+    residual_sd: float
+    misfit: float
+    n_frames: int
+
+    @property
+    def offset_sd_s(self) -> float:
+        """Return the sd of the offset, s."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlation:
+    """Of optical with inertial angular rates, over lags: of their sizes, and of the vectors."""
+
+    lags_s: FloatArray
+    speed: FloatArray
+    vector: FloatArray
+
+    def at(self, lag_s: float) -> tuple[float, float]:
+        """Return both at the grid point nearest to a lag."""
+        i = int(np.argmin(np.abs(self.lags_s - lag_s)))
+        return float(self.speed[i]), float(self.vector[i])
+
+    def candidates_s(self) -> FloatArray:
+        """Return the lags of the local maxima that come near the greatest, at most four of each kind."""
+        found: list[float] = []
+        for c in (self.speed, self.vector):
+            c = np.where(np.isfinite(c), c, -np.inf)
+            padded = np.concatenate([[-np.inf], c, [-np.inf]])
+            top = (c >= padded[:-2]) & (c >= padded[2:]) & (c > max(c.max() - 0.3, 0.0))
+            index = np.flatnonzero(top)
+            for lag in self.lags_s[index[np.argsort(-c[index])][:4]]:
+                if all(abs(lag - other) > 0.012 for other in found):
+                    found.append(float(lag))
+        return np.array(found)
+
+
+def correlate(
+    t_s: FloatArray, R: FloatArray, signal: ImuSignal, *, centre_s: float, max_offset_s: float
+) -> Correlation:
+    """Return the normalised correlations over lags within ``centre_s +- max_offset_s``.
+
+    The angular speed is the same in all axes, so it finds the offset even when the IMU's axes are wrongly
+    known; the vector is the sharper of the two when they are right. The optical rate of a pair of frames is
+    compared with the gyro's mean over the same interval.
+    """
+    dt = np.diff(t_s)
+    pair = dt < 1.5 * np.median(dt)
+    start, dt = t_s[:-1][pair], dt[pair]
+    optical = rvec_from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:])[pair] / dt[:, None]
+    n_side = int(np.ceil(max_offset_s / GRID_S))
+    lags = np.asarray(centre_s + np.arange(-n_side, n_side + 1) * GRID_S, dtype=np.float64)
+    begin = start + lags[:, None]
+    inertial = (signal.angle_at(begin + dt) - signal.angle_at(begin)) / dt[:, None]
+    use = ~(signal.in_gap(begin) | signal.in_gap(begin + dt))
+    enough = use.sum(axis=1) >= MIN_POSES
+
+    def normalised(a: FloatArray, b: FloatArray) -> FloatArray:
+        """Return the correlation over pairs and components, for a (n, c) and b (lags, n, c)."""
+        w = use[..., None] / np.maximum(use.sum(axis=1), 1)[:, None, None]
+        a = a - (w * a).sum(axis=1, keepdims=True)
+        b = b - (w * b).sum(axis=1, keepdims=True)
+        scale = np.sqrt((w * a * a).sum(axis=(1, 2)) * (w * b * b).sum(axis=(1, 2)))
+        ok = enough & (scale > 0)
+        return np.where(ok, (w * a * b).sum(axis=(1, 2)) / np.where(ok, scale, 1.0), np.nan)
+
+    speed = normalised(
+        np.linalg.norm(optical, axis=-1, keepdims=True), np.linalg.norm(inertial, axis=-1, keepdims=True)
+    )
+    return Correlation(lags, speed, normalised(optical, inertial))
+
+
+class RotationFit:
+    """Least squares of optical attitudes against the integrated gyro, for offset, skew and slow drift.
+
+    The optical noise of neighbouring frame-to-frame rotations is anticorrelated. Whitened, their least
+    squares is that of the attitudes themselves less a slowly varying misalignment: hat functions every half
+    second for each axis, which take up start attitude, bias, gyro noise and scale error.
+    """
+
+    def __init__(
+        self, t_s: FloatArray, R: FloatArray, sd_rad: FloatArray, signal: ImuSignal, *, skew_prior_sd: float
+    ) -> None:
+        self._t, self._R, self._sd, self._signal = t_s, R, sd_rad, signal
+        self._t_mid = 0.5 * (t_s[0] + t_s[-1])
+        self._skew_prior_sd = skew_prior_sd
+        n = int(np.ceil((signal.t_s[-1] - signal.t_s[0]) / _NODE_S))
+        self._nodes = np.linspace(signal.t_s[0], signal.t_s[-1], n + 1)
+        self._pieces = signal.pieces()
+        self._remove_bias(np.zeros(3))
+        self._unbiased = self._attitude  # every solution begins with it
+
+    def _remove_bias(self, bias_radps: FloatArray) -> None:
+        """Integrate the gyro anew, less a bias."""
+        self._gyro_bias = bias_radps
+        self._attitude = integrated_attitudes(self._pieces, self._nodes, bias_radps)
+
+    def _hats(self, t_s: FloatArray, segment: IntArray) -> tuple[IntArray, FloatArray, int]:
+        """Return hat functions of time, separate for each stretch between IMU gaps.
+
+        Of each frame: the knot before it, and its share of the way to the next; and how many knots there are.
+        """
+        knot, share = np.zeros(len(t_s), dtype=np.int64), np.zeros(len(t_s))
+        n_before = 0
+        for k in np.unique(segment):
+            inside = segment == k
+            lo, hi = t_s[inside].min(), t_s[inside].max()
+            n_knots = max(2, round((hi - lo) / _KNOT_S) + 1)
+            place = (t_s[inside] - lo) / (hi - lo) * (n_knots - 1)
+            first = np.minimum(place.astype(np.int64), n_knots - 2)
+            knot[inside], share[inside] = n_before + first, place - first
+            n_before += n_knots
+        return knot, share, n_before
+
+    def _frames_beside_gyro(self, offset_s: float) -> tuple[BoolArray, IntArray]:
+        """Return the frames whose IMU time has samples around, and the stretch between long gaps of each."""
+        signal, t_imu = self._signal, self._t + offset_s
+        inside = (t_imu > signal.t_s[0] + 0.005) & (t_imu < signal.t_s[-1] - 0.005) & ~signal.in_gap(t_imu)
+        long = np.diff(signal.gaps_s, axis=1)[:, 0] > 2.5 * signal.period_s
+        segment = np.searchsorted(signal.gaps_s[long, 0], t_imu)
+        for k in np.unique(segment):
+            if (inside & (segment == k)).sum() < 6:
+                inside[segment == k] = False
+        return inside, segment
+
+    def solve(self, offset_s: float) -> Fit | None:
+        """Return the fit that starts at an offset, or None where too few frames have gyro beside them."""
+        inside, segment = self._frames_beside_gyro(offset_s)
+        if inside.sum() < MIN_POSES:
+            return None
+        t, R, inverse_sd = self._t[inside], self._R[inside], 1 / self._sd[inside]
+        knot, share, n_knots = self._hats(t, segment[inside])
+        n, since_mid = len(t), t - self._t_mid
+        self._gyro_bias, self._attitude = np.zeros(3), self._unbiased
+        offset, skew, sd = float(offset_s), 0.0, float("nan")
+        covariance, bias_covariance = np.eye(3), np.eye(3)
+        prior = np.diag([0.0, self._skew_prior_sd**-2, LOSS_PRIOR_SD_S2**-2])
+        lost = 0.0
+        weight = np.ones(n)
+        for iteration in range(12):
+            t_imu = t + offset + skew * since_mid
+            attitude, error, design = compare_with_gyro(
+                self._pieces, self._nodes, self._attitude, self._gyro_bias, t_imu, since_mid, R
+            )
+            w = weight * inverse_sd
+            normal, right = normal_equations(w, knot, share, n_knots, design, error)
+            normal += prior
+            if not (np.isfinite(normal).all() and normal[0, 0] > 0):
+                return None
+            step = np.linalg.solve(normal, right - np.array([0.0, skew, 0.0]) @ prior)
+            remainder = error - design @ step
+            lost = float(step[2])
+            drift = drift_of(w, knot, share, n_knots, remainder)
+            residual = np.linalg.norm((remainder - drift) * inverse_sd[:, None], axis=1) / np.sqrt(3)
+            freedom = max(n - n_knots - 1, 1) / n
+            # The median of sqrt(chi-square of 3 / 3) is 0.888.
+            sd = max(float(np.median(residual)) / 0.888 / np.sqrt(freedom), 1e-6)
+            weight = (1 + (residual / (2.5 * sd)) ** 2) ** -0.25  # soft-L1 by reweighting
+            covariance = np.linalg.inv(normal) * sd**2
+            offset, skew = offset + float(np.clip(step[0], -0.02, 0.02)), skew + float(step[1])
+            if iteration == 2:
+                # A bias left in turns the axes in which the errors are compared.
+                bias, bias_covariance = self._bias(t, attitude, drift, sd * self._sd[inside])
+                self._remove_bias(bias)
+            elif abs(step[0]) < 1e-7 and iteration > 3:
+                break
+        bias, bias_covariance = self._bias(t, attitude, drift, sd * self._sd[inside])
+        misfit = 3 * float(np.minimum(residual**2, _MISFIT_CAP * sd**2).sum())
+        bias_sd = np.sqrt(np.diag(bias_covariance))
+        return Fit(offset, skew, lost, self._gyro_bias + bias, bias_sd, covariance, sd, misfit, n)
+
+    @staticmethod
+    def _bias(
+        t: FloatArray, attitude: FloatArray, drift: FloatArray, sd_rad: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the bias, and its covariance, of ``drift = const - integral of attitude @ bias``."""
+        span = np.concatenate([[0.0], np.diff(t)])[:, None, None]
+        integral = np.cumsum(span * attitude, axis=0)
+        design = np.concatenate([-integral, np.broadcast_to(np.eye(3), attitude.shape)], axis=2)
+        A = (design / sd_rad[:, None, None]).reshape(-1, 6)
+        covariance = np.asarray(np.linalg.inv(A.T @ A + np.eye(6)), dtype=np.float64)
+        bias = covariance @ (A.T @ (drift / sd_rad[:, None]).reshape(-1))
+        return np.asarray(bias[:3], dtype=np.float64), covariance[:3, :3]
+
+
+def as_likely(fit: Fit, best: Fit) -> bool:
+    """Return whether the data tell two fits apart by less than five sd."""
+    excess = 3 * min(fit.n_frames, best.n_frames) * ((fit.residual_sd / best.residual_sd) ** 2 - 1)
+    return bool(excess < _AMBIGUOUS_SIGMA**2)

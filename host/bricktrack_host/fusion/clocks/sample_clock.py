@@ -1,0 +1,145 @@
+"""When a free-running sensor truly took its samples, found from reads that beat with it.
+
+A BNO055 samples on its own clock, which differs from ours by parts in a thousand, and keeps the latest sample
+for whoever asks. Reads on a grid of our own clock find a sample of some age: it grows or shrinks by the
+difference of the clocks until, a whole period old or none, one is left out or read twice. Taken for the time
+of measurement, the stamps are wrong by a saw-tooth of one period: 10 ms, 3 mm at 0.3 m/s.
+"""
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.errors import ShapeError
+from bricktrack_common.imu_records import UNUSABLE, ImuFlag
+from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
+from bricktrack_host.fusion.clocks.saw_tooth import MIN_PAIRS, STEP_S, SawTooth, SawToothSearch
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.tracks import ImuTrack
+
+logger = logging.getLogger(__name__)
+
+_EARN = 45.0  # chi-square that a saw-tooth must earn; the best of 50 000 by chance earns some 22
+RATE_SD = 2e-4  # of a clock that was found, before the attitudes have told its skew
+_RATE_STEP = 2e-5
+_ANY_RATE_SD = 0.01  # of stamps whose own clock is wrong
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleClock:
+    """The sensor's own clock: sample k was taken at ``first_ns + k * period_ns``.
+
+    Attributes
+    ----------
+    first_ns : int, on the clock of the stamps
+    period_ns : float, ns
+    sample : ndarray of int64, shape (n,)
+        Which sample each read found.
+    n_skipped : int
+        Samples that no read found, though there was one in every slot.
+    """
+
+    first_ns: int
+    period_ns: float
+    sample: IntArray
+    n_skipped: int
+
+    def restamp(self, imu: ImuTrack) -> ImuTrack:
+        """Return the track with the instants of measurement for stamps; samples read twice are flagged.
+
+        Raises
+        ------
+        ShapeError
+            If the track is not the one the clock was found for.
+        """
+        if len(imu.t_ns) != len(self.sample):
+            raise ShapeError(
+                f"the sample clock is of {len(self.sample)} reads and the track has {len(imu.t_ns)}; "
+                "align the times of this very track"
+            )
+        flags = imu.flags.copy()
+        flags[1:][np.diff(self.sample) == 0] |= int(ImuFlag.REPEAT)
+        t_ns = self.first_ns + np.round(self.sample * self.period_ns).astype(np.int64)
+        return replace(imu, t_ns=t_ns, flags=flags)
+
+
+def find_sample_clock(
+    t_s: FloatArray, R: FloatArray, sd_rad: FloatArray, signal: ImuSignal, imu: ImuTrack, *, as_read: Fit
+) -> SampleClock | None:
+    """Return the sensor's own clock, or None where the stamps serve as well.
+
+    Parameters
+    ----------
+    t_s : ndarray, shape (n,)
+        Frames with a pose, camera time, seconds after the signal's epoch.
+    R : ndarray, shape (n, 3, 3)
+        Their attitudes.
+    sd_rad : ndarray, shape (n,)
+    signal : ImuSignal
+        Of ``imu`` with its stamps as read.
+    imu : ImuTrack
+    as_read : Fit
+        Of the attitudes to the gyro by those stamps.
+    """
+    offset_s = as_read.offset_s
+    if len(t_s) <= MIN_PAIRS:
+        return None
+    search = SawToothSearch(t_s, R, sd_rad, signal, imu, offset_s=offset_s)
+    if search.n_pairs < MIN_PAIRS:
+        return None
+    way = search.coarse()
+    earned = search.null_cost() - way.cost
+    logger.debug("a saw-tooth of %.0f ppm earns %.0f", way.rate * 1e6, earned)
+    # A sample found twice proves a clock of its own, however little the motion shows of it.
+    if earned < (-_EARN if search.has_repeats else _EARN):
+        return None
+
+    def clock_of(way: SawTooth) -> SampleClock:
+        sample, period_ns = search.samples(way), search.period_s * (1 + way.rate) * 1e9
+        first_ns = signal.epoch_ns + round(search.first_sample_s(way) * 1e9 + float(sample[0]) * period_ns)
+        read = np.flatnonzero((imu.flags & int(UNUSABLE)) == 0)
+        skipped = np.maximum(np.diff(sample[read]) - np.diff(read), 0)
+        return SampleClock(first_ns, period_ns, sample - sample[0], int(skipped.sum()))
+
+    def fit_of(clock: SampleClock, way: SawTooth) -> Fit | None:
+        restamped = ImuSignal.from_track(clock.restamp(imu))
+        at_s = t_s + (signal.epoch_ns - restamped.epoch_ns) * 1e-9
+        solver = RotationFit(at_s, R, sd_rad, restamped, skew_prior_sd=RATE_SD)
+        return solver.solve(offset_s + way.lag_s)
+
+    def best_of(ways: list[SawTooth]) -> tuple[SawTooth, SampleClock, Fit] | None:
+        """Return the way under which the attitudes agree best with the gyro, all else that is known added."""
+        tried = []
+        for way in ways:
+            clock = clock_of(way)
+            fit = fit_of(clock, way)
+            if fit is not None:
+                tried.append((way, clock, fit))
+        if not tried:
+            return None
+        sd = min(fit.residual_sd for _, _, fit in tried)
+        return min(tried, key=lambda one: one[2].misfit / sd**2 + one[0].read_cost)
+
+    best = best_of(search.ways(way, rate_sd=STEP_S / search.span_s))
+    if best is None:
+        return None
+    # The attitudes know the rate better than the rotations between frames: once more with theirs.
+    way, _, fit = best
+    way = replace(way, rate=way.rate - fit.skew)
+    best = best_of(search.ways(way, rate_sd=_RATE_STEP)) or best
+    _, clock, fit = best
+    if not search.has_repeats:
+        # Stamps at a wrong rate are a straight line and no saw-tooth, and so is one that never wraps.
+        read = np.flatnonzero((imu.flags & int(UNUSABLE)) == 0)
+        line = RotationFit(t_s, R, sd_rad, signal, skew_prior_sd=_ANY_RATE_SD).solve(offset_s) or as_read
+        left = min(as_read.misfit, line.misfit) - fit.misfit
+        if left < _EARN * fit.residual_sd**2 or (np.diff(clock.sample[read]) == np.diff(read)).all():
+            return None
+    logger.info(
+        "the inertial sensor samples by its own clock, %.0f ppm slow; %d samples were not read",
+        best[0].rate * 1e6,
+        clock.n_skipped,
+    )
+    return clock

@@ -1,0 +1,1 @@
+"""What the inertial sensor says: samples, their signals and their noise."""

@@ -1,0 +1,318 @@
+"""Inertial samples as continuous signals: splines, how far to trust them, and motion between instants.
+
+Times inside are seconds after `ImuSignal.epoch_ns` on the clock of the samples.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PPoly
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_host.compiled import compiled
+from bricktrack_host.fusion.inertial.imu_samples import (
+    BRIDGE_PERIODS,
+    CleanSamples,
+    bridge_error,
+    clean_samples,
+    fill_instants,
+    roughness,
+)
+from bricktrack_host.fusion.inertial.signal_kernel import SignalPieces, integrate_steps
+from bricktrack_host.tracks import ImuTrack
+
+_GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Increments:
+    """What the samples say of the motion from one instant to another, in body axes at the first.
+
+    Attributes
+    ----------
+    R : ndarray, shape (n, 3, 3)
+        Body at the end seen from body at the start.
+    dv_mps, dp_m : ndarray, shape (n, 3)
+        Integral, and double integral, of the specific force.
+    R_half : ndarray, shape (n, 3, 3)
+        Body half-way seen from body at the start.
+    f_rate_mps3, f_curve_mps4 : ndarray, shape (n, 3)
+        Mean first and second derivative of the specific force, as measured.
+    """
+
+    R: FloatArray
+    dv_mps: FloatArray
+    dp_m: FloatArray
+    R_half: FloatArray
+    f_rate_mps3: FloatArray
+    f_curve_mps4: FloatArray
+
+
+def sharpened(t_s: FloatArray, values: FloatArray, filter_s: float) -> FloatArray:
+    """Return samples with the amplitudes that a low-pass took from them, at the times where it put them.
+
+    The low-pass is of second order and critically damped, ``1 / (1 + s filter_s)^2``: mean delay
+    ``2 filter_s``, -3 dB at ``0.102 / filter_s`` Hz. Without its delay its inverse is
+    ``1 - u^2 + 2/3 u^3 + O(u^5)`` with ``u = s filter_s``, whose derivatives are those of five points.
+
+    Parameters
+    ----------
+    t_s : ndarray, shape (n,)
+    values : ndarray, shape (n, 3)
+    filter_s : float, s
+        Nothing is done at zero.
+    """
+    if filter_s <= 0:
+        return values
+    step = float(np.median(np.diff(t_s)))
+    at = CubicSpline(t_s, values)
+    far_before, before, after, far_after = (
+        at(np.clip(t_s + k * step, t_s[0], t_s[-1])) for k in (-2, -1, 1, 2)
+    )
+    second = (16 * (before + after) - 30 * values - far_before - far_after) / (12 * step**2)
+    third = (far_after - far_before - 2 * (after - before)) / (2 * step**3)
+    return np.asarray(values - filter_s**2 * second + 2 / 3 * filter_s**3 * third)
+
+
+def _spline(
+    t_s: FloatArray, values: FloatArray, period_s: float, fill: tuple[FloatArray, FloatArray] | None
+) -> CubicSpline[Any]:
+    """Return the cubic through samples and the fill's instants and values, shape (m,) and (m, 3).
+
+    In a long gap without a fill, points on the chord keep it from swinging across.
+    """
+    knots, at_knots = t_s, values
+    for i in np.flatnonzero(np.diff(t_s) > BRIDGE_PERIODS * period_s)[::-1]:
+        between, at = fill_instants(t_s[i], t_s[i + 1], period_s), None
+        if fill is not None:
+            inside = (fill[0] > t_s[i]) & (fill[0] < t_s[i + 1])
+            between, at = (fill[0][inside], fill[1][inside]) if inside.any() else (between, None)
+        if at is None:
+            share = (between[:, None] - t_s[i]) / (t_s[i + 1] - t_s[i])
+            at = values[i] + share * (values[i + 1] - values[i])
+        knots = np.insert(knots, i + 1, between)
+        at_knots = np.insert(at_knots, i + 1, at, axis=0)
+    return CubicSpline(knots, at_knots)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSignal:
+    """Angular rate and specific force of one run as cubic splines of time.
+
+    Attributes
+    ----------
+    samples : CleanSamples
+        What it was made of.
+    period_s : float
+        Median sample interval.
+    gyro_radps, acc_mps2 : ndarray, shape (n, 3)
+        Those samples, with the low-passes undone.
+    gyro_roughness_radps, acc_roughness_mps2 : ndarray, shape (n,)
+        The steady part, see `roughness`.
+    gyro_impact_radps, acc_impact_mps2 : ndarray, shape (n,)
+        The pulses, see there.
+    gyro_bridge_radps, acc_bridge_mps2 : ndarray, shape (n,)
+        Error of the cubic where one sample is missing.
+    gaps_s : ndarray, shape (n_gaps, 2)
+        From the last sample before to the first after each interval with missing samples.
+    """
+
+    samples: CleanSamples
+    period_s: float
+    gyro_radps: FloatArray
+    acc_mps2: FloatArray
+    gyro_roughness_radps: FloatArray
+    acc_roughness_mps2: FloatArray
+    gyro_impact_radps: FloatArray
+    acc_impact_mps2: FloatArray
+    gyro_bridge_radps: FloatArray
+    acc_bridge_mps2: FloatArray
+    gaps_s: FloatArray
+    _gyro: CubicSpline[Any]
+    _acc: CubicSpline[Any]
+    _gyro_integral: PPoly[Any]
+    _acc_integral: PPoly[Any]
+    _acc_double: PPoly[Any]
+
+    @classmethod
+    def from_track(
+        cls, imu: ImuTrack, *, gyro_filter_s: float = 0.0, acc_filter_s: float = 0.0
+    ) -> "ImuSignal":
+        """Return the signals of a track; samples that are NaN, gaps or repeats are bridged.
+
+        The low-passes of the sensors are undone, but for their delays, see `sharpened`.
+
+        Raises
+        ------
+        ShapeError
+            If fewer than `MIN_SAMPLES` samples can be used, or their stamps do not increase.
+        """
+        return cls.from_samples(clean_samples(imu), gyro_filter_s=gyro_filter_s, acc_filter_s=acc_filter_s)
+
+    @classmethod
+    def from_samples(
+        cls, samples: CleanSamples, *, gyro_filter_s: float = 0.0, acc_filter_s: float = 0.0
+    ) -> "ImuSignal":
+        """Return the signals of samples that are clean; see `from_track`."""
+        t_s, gyro, acc = samples.t_s, samples.gyro_radps, samples.acc_mps2
+        interval = np.diff(t_s)
+        period_s = float(np.median(interval))
+        # Steady roughness before sharpening: what that adds to noise lies high, and is gone once integrated.
+        (gyro_steady, gyro_impact), (acc_steady, acc_impact) = roughness(gyro), roughness(acc)
+        if gyro_filter_s > 0:
+            gyro = sharpened(t_s, gyro, gyro_filter_s)
+            gyro_impact = roughness(gyro)[1]
+        missing = np.flatnonzero(interval > _GAP_PERIODS * period_s)
+        fill = samples.fill
+        gyro_spline = _spline(t_s, gyro, period_s, None if fill is None else (fill.t_s, fill.gyro_radps))
+        acc_spline = _spline(t_s, acc, period_s, None if fill is None else (fill.t_s, fill.acc_mps2))
+        signal = cls(
+            samples=samples,
+            period_s=period_s,
+            gyro_radps=gyro,
+            acc_mps2=acc,
+            gyro_roughness_radps=gyro_steady,
+            acc_roughness_mps2=acc_steady,
+            gyro_impact_radps=gyro_impact,
+            acc_impact_mps2=np.maximum(acc_impact, samples.filled_sd_mps2),
+            gyro_bridge_radps=bridge_error(gyro),
+            acc_bridge_mps2=bridge_error(acc),
+            gaps_s=np.stack([t_s[missing], t_s[missing + 1]], axis=1),
+            _gyro=gyro_spline,
+            _acc=acc_spline,
+            _gyro_integral=gyro_spline.antiderivative(),
+            _acc_integral=acc_spline.antiderivative(),
+            _acc_double=acc_spline.antiderivative(2),
+        )
+        return signal if acc_filter_s == 0 else signal.with_acc_filter(acc_filter_s)
+
+    def with_acc_filter(self, acc_filter_s: float) -> "ImuSignal":
+        """Return the signals with this low-pass of the accelerometer undone, in place of any other."""
+        samples = self.samples
+        acc = sharpened(samples.t_s, samples.acc_mps2, acc_filter_s)
+        fill = samples.fill
+        spline = _spline(samples.t_s, acc, self.period_s, None if fill is None else (fill.t_s, fill.acc_mps2))
+        return replace(
+            self,
+            acc_mps2=acc,
+            acc_impact_mps2=np.maximum(roughness(acc)[1], samples.filled_sd_mps2),
+            acc_bridge_mps2=bridge_error(acc),
+            _acc=spline,
+            _acc_integral=spline.antiderivative(),
+            _acc_double=spline.antiderivative(2),
+        )
+
+    @property
+    def epoch_ns(self) -> int:
+        """Zero of the seconds below, on the samples' clock."""
+        return self.samples.epoch_ns
+
+    @property
+    def t_s(self) -> FloatArray:
+        """Instants of the samples that are used, shape (n,)."""
+        return self.samples.t_s
+
+    @property
+    def clip_sd_mps2(self) -> FloatArray:
+        """Above zero where a sample was clipped or stands beside one, shape (n,)."""
+        return self.samples.clip_sd_mps2
+
+    def _held(self, t_s: FloatArray) -> FloatArray:
+        return np.clip(t_s, self.t_s[0], self.t_s[-1])
+
+    def gyro_at(self, t_s: FloatArray) -> FloatArray:
+        """Return the measured angular rate, rad/s; held beyond the first and last sample."""
+        return np.asarray(self._gyro(self._held(t_s)))
+
+    def acc_at(self, t_s: FloatArray) -> FloatArray:
+        """Return the measured specific force, m/s^2; held beyond the first and last sample."""
+        return np.asarray(self._acc(self._held(t_s)))
+
+    def _integral(self, integral: PPoly[Any], spline: CubicSpline[Any], t_s: FloatArray) -> FloatArray:
+        held = self._held(t_s)
+        return np.asarray(integral(held) + spline(held) * (t_s - held)[..., None])
+
+    def gyro_rate_at(self, t_s: FloatArray) -> FloatArray:
+        """Return how fast the measured angular rate changes, rad/s^2."""
+        return np.asarray(self._gyro(self._held(t_s), 1))
+
+    def angle_at(self, t_s: FloatArray) -> FloatArray:
+        """Return the integral of the measured angular rate, component by component, rad."""
+        return self._integral(self._gyro_integral, self._gyro, t_s)
+
+    def in_gap(self, t_s: FloatArray, *, least_periods: float = 0.0) -> BoolArray:
+        """Return which instants lie where samples are missing for so long, or beyond the samples."""
+        outside = (t_s < self.t_s[0] - self.period_s) | (t_s > self.t_s[-1] + self.period_s)
+        gaps = self.gaps_s[np.diff(self.gaps_s, axis=1)[:, 0] > least_periods * self.period_s]
+        if len(gaps):
+            i = np.searchsorted(gaps[:, 0], t_s, side="left") - 1
+            outside |= (i >= 0) & (t_s < gaps[np.maximum(i, 0), 1])
+        return np.asarray(outside)
+
+    def increments(
+        self,
+        start_s: FloatArray,
+        end_s: FloatArray,
+        *,
+        gyro_bias_radps: FloatArray,
+        acc_bias_mps2: FloatArray,
+        acc_lag_s: float,
+    ) -> Increments:
+        """Return the motion between pairs of instants, by integrals of the splines over sub-steps.
+
+        Parameters
+        ----------
+        start_s, end_s : ndarray, shape (n,)
+            Any pairs a sample interval or less apart (longer ones lose accuracy).
+        gyro_bias_radps, acc_bias_mps2 : ndarray, shape (3,) or (n, 3)
+        acc_lag_s : float
+            Specific force at t is the sample stamped t + this (DESIGN 8.2).
+        """
+        n = len(start_s)
+        out = Increments(
+            R=np.empty((n, 3, 3)),
+            dv_mps=np.empty((n, 3)),
+            dp_m=np.empty((n, 3)),
+            R_half=np.empty((n, 3, 3)),
+            f_rate_mps3=np.empty((n, 3)),
+            f_curve_mps4=np.empty((n, 3)),
+        )
+        integrate_steps(
+            self.pieces(),
+            np.ascontiguousarray(start_s),
+            np.ascontiguousarray(end_s),
+            np.ascontiguousarray(np.broadcast_to(gyro_bias_radps, (n, 3))),
+            np.ascontiguousarray(np.broadcast_to(acc_bias_mps2, (n, 3))),
+            float(acc_lag_s),
+            out.R, out.dv_mps, out.dp_m, out.R_half, out.f_rate_mps3, out.f_curve_mps4,
+        )  # fmt: skip
+        return out
+
+    def pieces(self) -> SignalPieces:
+        """Return the splines for compiled loops."""
+        return SignalPieces(
+            knots_s=self._gyro.x,
+            span_s=(float(self.t_s[0]), float(self.t_s[-1])),
+            angle=self._gyro_integral.c,
+            gyro=self._gyro.c,
+            acc_twice=self._acc_double.c,
+            acc_once=self._acc_integral.c,
+            acc=self._acc.c,
+        )
+
+
+@compiled
+def chain_rotations(steps: FloatArray) -> FloatArray:
+    """Return the running products ``steps[0] @ ... @ steps[i]``, shape (n, 3, 3)."""
+    out = np.empty_like(steps)
+    if len(steps):
+        out[0] = steps[0]
+    for k in range(1, len(steps)):
+        before, step = out[k - 1], steps[k]
+        for i in range(3):
+            for j in range(3):
+                out[k, i, j] = (
+                    before[i, 0] * step[0, j] + before[i, 1] * step[1, j] + before[i, 2] * step[2, j]
+                )
+    return out

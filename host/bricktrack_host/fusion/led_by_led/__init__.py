@@ -1,0 +1,1 @@
+"""Fusion in which each LED counts by itself, at the time of its row."""

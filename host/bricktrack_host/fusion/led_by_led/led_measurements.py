@@ -1,0 +1,238 @@
+"""LEDs one by one as the smoother's measurements: each at its own row's instant, through the ray model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.camera_model import RayModel
+from bricktrack_common.rotations import skew
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial.imu_samples import seconds_since
+from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, noise_parts
+from bricktrack_host.fusion.smoothing.linearisation import Linearisation
+from bricktrack_host.fusion.smoothing.observation_kernel import LedArrays
+from bricktrack_host.fusion.smoothing.smoother import Estimate, Problem
+from bricktrack_host.tracking.led_model.led_profile import (
+    LedPrediction,
+    collar_of,
+    predict_leds,
+    shift_per_radius,
+)
+from bricktrack_host.tracking.led_tracker import NOT_USED
+from bricktrack_host.tracking.optical_track import led_times_ns
+from bricktrack_host.tracks import FusedTrack, LedObservations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenLeds:
+    """The LEDs of a run that were seen and identified, one row for each.
+
+    Attributes
+    ----------
+    frame, led : ndarray of int64, shape (m,)
+    t_ns : ndarray of int64, shape (m,), camera time
+        Mid-exposure of the LED's row.
+    uv_px, cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
+    spread_ns : ndarray, shape (m,), ns
+        Standard deviation of the instants at which its light was gathered: by exposure, and by its rows.
+    """
+
+    frame: IntArray
+    led: IntArray
+    t_ns: IntArray
+    uv_px: FloatArray
+    cov_px2: FloatArray
+    spread_ns: FloatArray
+
+    @classmethod
+    def of(cls, observations: LedObservations, ray_model: RayModel) -> "SeenLeds":
+        """Return the LEDs that may be used, in the order of their instants."""
+        _, t_ns = led_times_ns(observations, ray_model)
+        usable = (observations.led_flags & NOT_USED) == 0
+        usable &= np.isfinite(observations.uv_px).all(axis=2)
+        usable &= np.isfinite(observations.cov_px2).all(axis=(2, 3))
+        frame, led = np.nonzero(usable)
+        order = np.argsort(t_ns[frame, led], kind="stable")
+        frame, led = frame[order], led[order]
+        # Even over the exposure; over a disc's rows as a disc is wide.
+        rows = np.sqrt(np.nan_to_num(observations.area_px2[frame, led]) / np.pi) / 2
+        row_ns = ray_model.sensor_mode.row_delay_ns(1.0) - ray_model.sensor_mode.row_delay_ns(0.0)
+        spread_ns = np.hypot(observations.exposure_ns[frame] / np.sqrt(12), rows * row_ns)
+        return cls(frame, led, t_ns[frame, led], observations.uv_px[frame, led],
+                   observations.cov_px2[frame, led], spread_ns)  # fmt: skip
+
+    def take(self, rows: BoolArray) -> "SeenLeds":
+        """Return some of the rows."""
+        return rows_of(self, rows)
+
+    def beside_ns(self) -> IntArray:
+        """Return one spread before the middle of each one's light and one after, shape (2, m)."""
+        aside = np.rint(self.spread_ns).astype(np.int64)
+        return np.stack([self.t_ns - aside, self.t_ns + aside])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pictured:
+    """Where seen LEDs were expected by poses at their instants.
+
+    Attributes
+    ----------
+    R_camera_brick, t_camera_brick_mm : ndarray, shape (m, 3, 3), (m, 3)
+    residual_px : ndarray, shape (m, 2)
+        Seen less predicted.
+    J_px : ndarray, shape (m, 2, 6)
+        Of the prediction, by [dtheta rad, dt mm].
+    profile_shift_px : ndarray, shape (m, 2)
+        One standard deviation of what the profile leaves unknown, the same way in all LEDs.
+    from_centre_px : ndarray, shape (m, 2)
+        The predicted picture less the middle of the sensor's.
+    px_per_s : ndarray, shape (m, 2)
+        How fast the picture moves.
+    is_facing : ndarray of bool, shape (m,)
+        Whether the dome can be seen at all from there.
+    """
+
+    R_camera_brick: FloatArray
+    t_camera_brick_mm: FloatArray
+    residual_px: FloatArray
+    J_px: FloatArray
+    profile_shift_px: FloatArray
+    from_centre_px: FloatArray
+    px_per_s: FloatArray
+    is_facing: BoolArray
+
+
+def picture(
+    leds: SeenLeds,
+    motion: FusedTrack,
+    beside: tuple[FloatArray, FloatArray],
+    ray_model: RayModel,
+    brick: BrickModel,
+) -> Pictured:
+    """Predict seen LEDs for the motion at their instants, and rotations and positions, mm, at `beside_ns`.
+
+    A brick that is accelerated is not, on the mean over the time that its light is gathered, where it is in
+    the middle: by half the spread's square times the acceleration. The mean of the pictures a spread before
+    and after shows as much.
+    """
+    R, t_mm = motion.R_camera_brick, motion.t_camera_brick_mm
+    prediction = _predict(leds, R, t_mm, ray_model, brick)
+    before_px, after_px = (
+        _predict(leds, *pose, ray_model, brick).uv_px for pose in zip(*beside, strict=True)
+    )
+    J = _by_pose(prediction, leds, R, brick)
+    twist = np.concatenate([motion.omega_brick_radps, motion.v_camera_mmps], axis=1)
+    mode = ray_model.sensor_mode
+    return Pictured(
+        R_camera_brick=R,
+        t_camera_brick_mm=t_mm,
+        residual_px=leds.uv_px - 0.5 * (before_px + after_px),
+        J_px=J,
+        profile_shift_px=prediction.model_shift_px,
+        from_centre_px=prediction.uv_px - 0.5 * np.array([mode.width - 1, mode.height - 1]),
+        px_per_s=np.einsum("mij,mj->mi", J, twist),
+        is_facing=np.asarray(prediction.facing > 0, dtype=np.bool_),
+    )
+
+
+def _predict(
+    leds: SeenLeds, R: FloatArray, t_mm: FloatArray, ray_model: RayModel, brick: BrickModel
+) -> LedPrediction:
+    """Return predictions of single LEDs, shape (m,), each for its own pose."""
+    P, N = brick.led_positions_mm[leds.led], brick.led_axes[leds.led]
+    return predict_leds(
+        np.einsum("mij,mj->mi", R, P) + t_mm,
+        np.einsum("mij,mj->mi", R, N),
+        brick.led_radii_mm[leds.led],
+        ray_model,
+        collar_mm=collar_of(brick),
+        shift_sd_per_radius=shift_per_radius(collar_of(brick), brick),
+    )
+
+
+def _by_pose(prediction: LedPrediction, leds: SeenLeds, R: FloatArray, brick: BrickModel) -> FloatArray:
+    """Return the derivatives of single LEDs' pictures by their poses, shape (m, 2, 6)."""
+    P, N = brick.led_positions_mm[leds.led], brick.led_axes[leds.led]
+    turn = prediction.J_px_per_mm @ (R @ skew(P)) + prediction.J_px_per_axis @ (R @ skew(N))
+    return np.concatenate([-turn, prediction.J_px_per_mm], axis=2)
+
+
+def led_arrays(
+    leds: SeenLeds,
+    pictured: Pictured,
+    run: Run,
+    nodes: Nodes,
+    lin: Linearisation,
+    levels: tuple[NoiseLevel, NoiseLevel],
+    *,
+    scale: FloatArray,
+    use: BoolArray,
+    settings: FusionSettings,
+) -> LedArrays:
+    """Return the smoother's measurements of one run: each LED tied to the node nearest in time.
+
+    ``scale``, shape (m,), multiplies the stated sd of the centroids; ``use`` says which are shown to the
+    filter. What the inertial samples leave unsure between node and LED is added to the covariance.
+    """
+    t_cam_s = seconds_since(leds.t_ns, run.signal.epoch_ns)
+    t_s = run.imu_time_s(t_cam_s, lin)
+    after = np.clip(np.searchsorted(nodes.t_s, t_s), 1, len(nodes.t_s) - 1)
+    node = np.where(nodes.t_s[after] - t_s < t_s - nodes.t_s[after - 1], after, after - 1)
+    start_s = nodes.t_s[node]
+    step = run.signal.increments(
+        start_s, t_s, gyro_bias_radps=lin.bg_radps, acc_bias_mps2=lin.ba_mps2, acc_lag_s=lin.lag_s
+    )
+    dt = t_s - start_s
+    J = pictured.J_px.copy()
+    J[..., 3:] *= 1e3
+    parts = noise_parts(run.signal, np.sort(np.stack([start_s, t_s]), axis=0), lin, settings)
+    turn = parts.gyro(levels[0]) * np.abs(dt)
+    shift = parts.acc(levels[1]) * np.abs(dt) ** 3 / 3
+    between = np.repeat(np.stack([turn, shift], axis=1), 3, axis=1)
+    cov = scale[:, None, None] ** 2 * leds.cov_px2 + np.einsum("mik,mk,mjk->mij", J, between, J)
+    first = np.searchsorted(node, np.arange(len(nodes.t_s) + 1))[:, None].astype(np.int64)
+    return LedArrays(
+        first=first,
+        use=use,
+        dt_s=dt,
+        since_mid_s=t_cam_s - run.t_mid_s,
+        R_step=step.R,
+        dv_mps=step.dv_mps,
+        dp_m=step.dp_m,
+        omega_radps=run.signal.gyro_at(t_s),
+        R_lin=pictured.R_camera_brick,
+        t_lin_m=pictured.t_camera_brick_mm * 1e-3,
+        residual_px=pictured.residual_px,
+        J=J,
+        cov_px2=cov,
+        nis=np.zeros(len(dt)),
+        inflation=np.ones(len(dt)),
+    )
+
+
+def led_chi2(problem: Problem, estimate: Estimate) -> FloatArray:
+    """Return how far each LED lies from what all the others say, over its covariance (2 degrees of freedom).
+
+    See `noise_choice.frame_chi2`; of one run that is a batch alone. NaN where rounding leaves no covariance
+    to judge by.
+    """
+    leds = problem.leds
+    if leds is None:
+        raise ValueError("the problem has no LEDs")
+    y, A = estimate.led_residual_px, estimate.led_cov_px2
+    given = leds.cov_px2 * leds.inflation[:, None, None]
+    rest = _inverse(1.02 * given - A)
+    S = leds.cov_px2 + np.where(leds.use[:, None, None], A + A @ rest @ A, A)
+    y = np.where(leds.use[:, None], (given @ rest @ y[..., None])[..., 0], y)
+    return np.asarray(np.einsum("mi,mij,mj->m", y, _inverse(S), y))
+
+
+def _inverse(S: FloatArray) -> FloatArray:
+    """Return the inverses of covariances, shape (m, 2, 2); NaN of those that are not positive definite."""
+    a, b, c = S[:, 0, 0], 0.5 * (S[:, 0, 1] + S[:, 1, 0]), S[:, 1, 1]
+    det = a * c - b * b
+    det = np.where((a > 0) & (det > 0), det, np.nan)
+    return np.stack([c, -b, -b, a], axis=1).reshape(-1, 2, 2) / det[:, None, None]

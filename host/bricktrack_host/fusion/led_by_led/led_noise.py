@@ -1,0 +1,163 @@
+"""How far centroids and inertial samples are to be believed, found from how well they agree LED by LED.
+
+Frames 30 times a second say little of what happens between them; LEDs, each at its own row's instant, say
+more. So what poses have settled (`noise_choice`) is settled once more: the noise of the centroids from their
+residuals, and what of the inertial samples is error from how likely the LEDs are.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
+from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts, noise_parts
+from bricktrack_host.fusion.smoothing.linearisation import Linearisation
+from bricktrack_host.fusion.smoothing.smoother import Problem, score_noise
+from bricktrack_host.fusion.smoothing.smoother_kernel import NIS_CAP
+
+STATED_SCALES = np.ones(2)
+_STILL_PX = 0.3
+_MIN_SIGHTINGS = 60
+_LEAST_SCALE = 0.1
+_CHI_2_MEDIAN = 1.386  # median of chi-square with 2 degrees of freedom
+_STEP = 2.0
+_EARN_PER_STEP = 2.0  # log-likelihood that a step away from what is stated must earn
+_MOST_STEPS = 5
+_MIN_IMPACTS = 4  # fewer count as many
+
+
+def still_sightings(leds: SeenLeds) -> BoolArray:
+    """Return which LEDs are seen where they were a frame before, shape (m,).
+
+    There mosaic, pixel grid and codec make the same error again, and the noise is that of the light alone.
+    """
+    order = np.lexsort((leds.frame, leds.led))
+    frame, led, uv = leds.frame[order], leds.led[order], leds.uv_px[order]
+    again = (np.diff(led) == 0) & (np.diff(frame) == 1)
+    again &= np.linalg.norm(np.diff(uv, axis=0), axis=1) < _STILL_PX
+    still = np.zeros(len(frame), dtype=np.bool_)
+    still[order[1:]] = again
+    return still
+
+
+def centroid_scales(chi2: FloatArray, still: BoolArray, use: BoolArray, scale: FloatArray) -> FloatArray:
+    """Return what the stated sd of the centroids is to be multiplied by, shape (2,): moving, and still.
+
+    ``chi2``: squared residuals of each LED to all others, over covariances with ``scale``; NaN says nothing.
+    """
+    out, use = scale.copy(), use & np.isfinite(chi2)
+    enough = [int((use & (still == c)).sum()) >= _MIN_SIGHTINGS for c in (False, True)]
+    for i, c in enumerate((False, True)):
+        part = use & (still == c) if enough[i] else use
+        if part.any():
+            out[i] = max(scale[i] * float(np.sqrt(np.median(chi2[part]) / _CHI_2_MEDIAN)), _LEAST_SCALE)
+    if not enough[0]:
+        out[0] = max(out.max(), 1.0)  # a picture at rest says nothing of one that moves
+    if not enough[1]:
+        out[1] = out[0]
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class InertialNoise:
+    """What of the inertial samples is believed to be error, in steps of a factor of two from what is stated.
+
+    Attributes
+    ----------
+    gyro_rough, acc_rough, gyro_systematic, acc_systematic, impact : int
+    n_impacts : int
+        From so few pulses the share of impacts was chosen; 0: it was not.
+    """
+
+    gyro_rough: int = 0
+    acc_rough: int = 0
+    gyro_systematic: int = 0
+    acc_systematic: int = 0
+    impact: int = 0
+    n_impacts: int = 0
+
+    @property
+    def n_steps(self) -> int:
+        """Return how far from what is stated."""
+        return sum(abs(getattr(self, kind)) for kind in _KINDS)
+
+    def levels(self, stated: tuple[NoiseLevel, NoiseLevel]) -> tuple[NoiseLevel, NoiseLevel]:
+        """Return the levels of gyro and accelerometer."""
+        gyro, acc = stated
+        return (
+            NoiseLevel(
+                gyro.roughness * _STEP**self.gyro_rough, gyro.systematic * _STEP**self.gyro_systematic
+            ),
+            NoiseLevel(acc.roughness * _STEP**self.acc_rough, acc.systematic * _STEP**self.acc_systematic),
+        )
+
+    def settings(self, stated: FusionSettings) -> FusionSettings:
+        """Return settings with the share of impacts."""
+        share = _STEP**self.impact
+        if self.n_impacts:
+            # Student's t: what a few pulses were off by tells their spread no better.
+            n = max(self.n_impacts, _MIN_IMPACTS)
+            share = share * float(np.sqrt(n / (n - 2)))
+        return replace(
+            stated, gyro_impact_share=stated.gyro_impact_share * share,
+            acc_impact_share=stated.acc_impact_share * share,
+        )  # fmt: skip
+
+
+_KINDS = ("acc_rough", "gyro_rough", "impact", "acc_systematic", "gyro_systematic")
+
+
+def choose_inertial_noise(
+    problem: Problem,
+    run: Run,
+    nodes: Nodes,
+    lin: Linearisation,
+    stated: tuple[NoiseLevel, NoiseLevel],
+    settings: FusionSettings,
+) -> InertialNoise:
+    """Return the noise of the inertial samples under which the LEDs of a run are likeliest.
+
+    One kind after the other, down as long as each step earns its price, or else up.
+    """
+
+    @cache
+    def parts_of(impact: int) -> NoiseParts:
+        return noise_parts(run.signal, nodes.t_s, lin, InertialNoise(impact=impact).settings(settings))
+
+    def score(choice: InertialNoise) -> float:
+        parts = parts_of(choice.impact)
+        gyro, acc = choice.levels(stated)
+        return _log_likelihood(problem, parts.gyro(gyro), parts.acc(acc)) - _EARN_PER_STEP * choice.n_steps
+
+    chosen = InertialNoise()
+    best = score(chosen)
+    for kind in _KINDS:
+        for step in (-1, 1):
+            start = chosen
+            while abs(getattr(chosen, kind)) < _MOST_STEPS:
+                tried = replace(chosen, **{kind: getattr(chosen, kind) + step})
+                reached = score(tried)
+                if reached <= best:
+                    break
+                chosen, best = tried, reached
+            if chosen is not start:
+                break
+    pulse = run.signal.acc_impact_mps2 > settings.impact_mps2
+    n_impacts = int(np.count_nonzero(pulse[1:] & ~pulse[:-1]))
+    return replace(chosen, n_impacts=n_impacts if chosen.impact else 0)
+
+
+def _log_likelihood(problem: Problem, gyro_var: FloatArray, acc_var: FloatArray) -> float:
+    """Return how likely the LEDs are; unlike the filter's own this knows no bound to what one may take away.
+
+    False LEDs are left out by now: what is far off is so because the samples were believed too much.
+    """
+    if problem.leds is None:
+        raise ValueError("the problem has no LEDs")
+    bounded = float(score_noise(problem, gyro_var[None, None], acc_var[None, None])[0][0, 0])
+    beyond = np.maximum(problem.leds.nis[problem.leds.use] - NIS_CAP, 0.0)
+    return bounded - 0.5 * float(beyond.sum())

@@ -1,0 +1,214 @@
+"""Errors that stand still over a run seen LED by LED: of the inertial sensor, and of the LEDs' pictures.
+
+What calibration, layout and profile leave of error in a centroid hardly changes while the brick moves by a
+few millimetres. Taken for noise it would average out over the frames, as it does not; taken for nothing the
+noise would be overstated. So a centroid's error is a noise that is new in every picture, and a part that
+stands still: of the profile and of the picture's size, common to all LEDs, and of each LED for itself. How
+large the latter is the run itself says, by the likelihood of its residuals.
+
+Like the errors of the inertial sensor (`sensor_errors`, which see for the method) these need not be states of
+the filter: one weighted least squares over the run gives them, and what stays unsure of them makes the motion
+unsure by the same derivatives.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.led_by_led.led_measurements import Pictured, SeenLeds
+from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
+from bricktrack_host.fusion.smoothing.sensor_errors import N_ERRORS, SensorErrors
+from bricktrack_host.fusion.smoothing.smoother import N_STATES, POS, Estimate, Filter, Problem
+from bricktrack_host.fusion.smoothing.standing_errors_kernel import carry_back, carry_forward
+from bricktrack_host.tracking.pose.refine import OWN_SHARE
+
+_ARM = slice(18, N_ERRORS)
+_PROFILE, _SCALE = N_ERRORS, N_ERRORS + 1
+_FIRST_LED = N_ERRORS + 2
+_SCALE_SD = 5e-5
+"""Of the picture's size: light falls off towards its corners, also across the width of one LED, and draws the
+centroid inwards by some 0.02 px at 400 px from the centre; a lens that warms up does as much."""
+_OFFSET_SDS_PX = np.geomspace(0.005, 1.0, 30)
+"""That single LEDs may be off by; any factor is as likely as the next before the run speaks."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StandingErrors:
+    """Errors that stand still, in one vector of q = 23 + 2 L: estimated, and how unsure.
+
+    In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
+    the profile's, in units of its stated sd; the picture's size over what it should be, less 1; (u, v) of
+    each of L LEDs, px.
+
+    Attributes
+    ----------
+    value : ndarray, shape (q,)
+    covariance : ndarray, shape (q, q)
+    offset_sd_px : float
+        Of the errors of single LEDs, as the run says.
+    """
+
+    value: FloatArray
+    covariance: FloatArray
+    offset_sd_px: float
+
+    @classmethod
+    def before(cls, run: Run, lever_arm_m: FloatArray, n_leds: int) -> "StandingErrors":
+        """Return what was taken out of a run's sensor already, given where it was said to be."""
+        gains = [(gain - np.eye(3)).ravel() for gain in (run.gyro_gain, run.acc_gain)]
+        value = np.concatenate([*gains, run.lever_arm_m - lever_arm_m, np.zeros(2 + 2 * n_leds)])
+        return cls(value, np.zeros((len(value), len(value))), 0.0)
+
+    def of_sensor(self, *, since: "StandingErrors") -> SensorErrors:
+        """Return what the inertial sensor's errors have changed by."""
+        change = (self.value - since.value)[:N_ERRORS]
+        gyro, acc = change[:18].reshape(2, 3, 3)
+        return SensorErrors(gyro, acc, change[_ARM], self.covariance[:N_ERRORS, :N_ERRORS])
+
+    def in_picture_px(self, leds: SeenLeds, pictured: Pictured, n_leds: int) -> FloatArray:
+        """Return by how much the centroids are off for them, shape (m, 2)."""
+        offset = self.value[_FIRST_LED:].reshape(n_leds, 2)
+        common = (
+            self.value[_PROFILE] * pictured.profile_shift_px + self.value[_SCALE] * pictured.from_centre_px
+        )
+        return np.asarray(common + offset[leds.led])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StandingPrior:
+    """What is believed of errors that stand still before the run speaks.
+
+    Attributes
+    ----------
+    sensor_sd : ndarray, shape (21,)
+        Zero where none are believed.
+    led_shift_px : ndarray, shape (L, 2)
+        One standard deviation of each LED's profile, of which a share is its own.
+    """
+
+    sensor_sd: FloatArray
+    led_shift_px: FloatArray
+
+    @classmethod
+    def of(cls, leds: SeenLeds, pictured: Pictured, n_leds: int, settings: FusionSettings) -> "StandingPrior":
+        """Return the belief for a run: the profile's share as it is on the mean over the run."""
+        count = np.maximum(np.bincount(leds.led, minlength=n_leds), 1)
+        shift = [
+            np.bincount(leds.led, part, minlength=n_leds) / count for part in pictured.profile_shift_px.T
+        ]
+        sensor_sd = np.repeat([settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3], [18, 3])
+        return cls(sensor_sd, np.stack(shift, axis=1))
+
+    def covariance(self, offset_sd_px: float) -> FloatArray:
+        """Return the covariance of all, shape (q, q), where single LEDs are off by so much."""
+        own = OWN_SHARE * self.led_shift_px
+        q = _FIRST_LED + own.size
+        out = np.zeros((q, q))
+        np.fill_diagonal(out, np.concatenate([self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(own.size)]))
+        for led, shift in enumerate(own):
+            part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
+            out[part, part] = offset_sd_px**2 * np.eye(2) + np.outer(shift, shift)
+        return out
+
+
+class StandingWay:
+    """A filter's way over a run's LEDs with the derivatives by all errors that stand still.
+
+    Parameters
+    ----------
+    problem, passed : Problem, Filter
+        Of LEDs; a run alone.
+    leds, pictured : SeenLeds, Pictured
+        Those of the problem.
+    n_leds : int
+    of : ndarray of int64, shape (c,)
+        The states whose covariance is wanted.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        passed: Filter,
+        leds: SeenLeds,
+        pictured: Pictured,
+        n_leds: int,
+        *,
+        of: IntArray,
+    ) -> None:
+        m, n_nodes = len(leds.t_ns), len(problem.has_frame)
+        own = _own_part(problem, leds, pictured, n_leds)
+        q, c = own.shape[2], len(of)
+        self._run, self._of, self._R = passed.runs[0], of, np.empty((n_nodes, 3, 3))
+        self._rows, self._changed = np.empty((n_nodes, c, N_STATES)), np.empty((n_nodes, c, q))
+        self._H, self._HP = np.empty((m, 2 * N_STATES)), np.empty((m, 2 * N_STATES))
+        self._y, self._dy = np.empty((m, 2)), np.empty((m, 2, q))
+        carry_forward(
+            self._run, np.ascontiguousarray(problem.gyro_var[:, 0]),
+            np.ascontiguousarray(problem.acc_var[:, 0]), problem.start.R[0].copy(), problem.start.x[0].copy(),
+            problem.P_start[0].copy(), own, of, self._R, self._rows, self._changed, self._H, self._HP,
+            self._y, self._dy,
+        )  # fmt: skip
+
+    def estimate(self, prior: StandingPrior, known: FloatArray) -> StandingErrors:
+        """Return the likeliest errors and their covariance, where ``known``, shape (q,), was taken out.
+
+        The sd of single LEDs' errors is the root of its mean square given the run's residuals.
+        """
+        dy, y = self._dy.reshape(-1, self._dy.shape[2]), self._y.ravel()
+        normal, pull = dy.T @ dy, dy.T @ y
+        belief = np.array([_fit(prior.covariance(sd), known, normal, pull)[0] for sd in _OFFSET_SDS_PX])
+        weight = np.exp(belief - belief.max())
+        offset_sd_px = float(np.sqrt((weight * _OFFSET_SDS_PX**2).sum() / weight.sum()))
+        _, change, covariance = _fit(prior.covariance(offset_sd_px), known, normal, pull)
+        return StandingErrors(known + change, covariance, offset_sd_px)
+
+    def with_doubt(self, estimate: Estimate, errors: StandingErrors) -> Estimate:
+        """Return smoothed states with what the errors leave unsure in their covariance."""
+        changed = self._changed.copy()
+        carry_back(self._run, self._R, self._H, self._HP, self._dy, self._rows, changed)
+        # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
+        at = np.searchsorted(self._of, np.arange(POS.start, POS.stop))[:, None]
+        changed[:, at, np.arange(_ARM.start, _ARM.stop)] -= self._R
+        more = changed @ errors.covariance @ np.swapaxes(changed, 1, 2)
+        covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
+        covariance[:, 0] += more
+        variance[:, 0, self._of] += np.diagonal(more, axis1=1, axis2=2)
+        return replace(estimate, covariance=covariance, variance=variance)
+
+
+def _own_part(problem: Problem, leds: SeenLeds, pictured: Pictured, n_leds: int) -> FloatArray:
+    """Return what each error changes of each LED's residual by itself, shape (m, 2, q)."""
+    arrays = problem.leds
+    if arrays is None:
+        raise ValueError("the problem has no LEDs")
+    m = len(leds.t_ns)
+    own = np.zeros((m, 2, _FIRST_LED + 2 * n_leds))
+    own[:, :, _ARM] = arrays.J[..., 3:] @ pictured.R_camera_brick
+    own[:, :, _PROFILE], own[:, :, _SCALE] = -pictured.profile_shift_px, -pictured.from_centre_px
+    at = _FIRST_LED + 2 * leds.led
+    own[np.arange(m), 0, at] = -1.0
+    own[np.arange(m), 1, at + 1] = -1.0
+    return own
+
+
+def _fit(
+    prior: FloatArray, known: FloatArray, normal: FloatArray, pull: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return log-likelihood, change and covariance of errors with this prior about zero.
+
+    ``known`` was taken out already. Errors with no variance stay as they are.
+    """
+    free = np.diagonal(prior) > 0
+    P, N = prior[np.ix_(free, free)], normal[np.ix_(free, free)]
+    believed = np.linalg.inv(P)
+    held = believed @ known[free]
+    b = pull[free] + held
+    covariance = np.linalg.inv(N + believed)
+    change, whole = np.zeros(len(known)), np.zeros_like(prior)
+    change[free] = -covariance @ b
+    whole[np.ix_(free, free)] = covariance
+    squares = known[free] @ held - b @ covariance @ b
+    log_det = np.linalg.slogdet(P)[1] - np.linalg.slogdet(covariance)[1]
+    return -0.5 * float(squares + log_det), change, whole

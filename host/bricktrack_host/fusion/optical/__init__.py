@@ -1,0 +1,1 @@
+"""Motion from the optical poses alone, and what stands beside a pose."""

@@ -1,0 +1,1 @@
+"""Fusion in which each frame counts as one pose."""

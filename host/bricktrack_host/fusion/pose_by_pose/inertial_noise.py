@@ -1,0 +1,116 @@
+"""How far inertial samples are to be trusted over a step: spectral densities of their errors, by cause."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from bricktrack_common.arrays import FloatArray
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraMotion
+from bricktrack_host.fusion.smoothing.linearisation import Linearisation
+
+_ONE_MISSING = 2.5  # periods between samples above which more than one is missing
+_NOISE_POINTS = 4  # of a step, over which its noise is averaged
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseParts:
+    """Spectral densities of inertial errors at instants, by cause; shape (n,), rad^2/s and m^2/s^3.
+
+    Attributes
+    ----------
+    gyro_fixed, acc_fixed
+        White noise of the samples, impacts, clipping, a sample bridged, and gaps: what their fill is off by,
+        or without one the whole spread of the signal.
+    gyro_rough, acc_rough
+        Steady roughness beyond the sensor's own noise, at a share of 1.
+    gyro_systematic, acc_systematic
+        Scale and lever-arm errors in proportion to the motion, which keep their sign for a while.
+    """
+
+    gyro_fixed: FloatArray
+    gyro_rough: FloatArray
+    gyro_systematic: FloatArray
+    acc_fixed: FloatArray
+    acc_rough: FloatArray
+    acc_systematic: FloatArray
+
+    def __add__(self, other: "NoiseParts") -> "NoiseParts":
+        """Return the densities of two sensors together."""
+        return NoiseParts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+    def gyro(self, level: "NoiseLevel") -> FloatArray:
+        """Return the whole density for one level."""
+        return np.asarray(
+            self.gyro_fixed
+            + level.roughness**2 * self.gyro_rough
+            + level.systematic**2 * self.gyro_systematic
+        )
+
+    def acc(self, level: "NoiseLevel") -> FloatArray:
+        """Return the whole density for one level."""
+        return np.asarray(
+            self.acc_fixed + level.roughness**2 * self.acc_rough + level.systematic**2 * self.acc_systematic
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseLevel:
+    """How much of the roughness, and how many times the stated systematic error, is believed to be error."""
+
+    roughness: float
+    systematic: float
+
+
+def noise_parts(
+    signal: ImuSignal, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
+) -> NoiseParts:
+    """Return how far the inertial signal is to be trusted over the steps between instants of IMU time."""
+    s, period, hold = settings, signal.period_s, settings.systematic_time_s
+    gyro = signal.gyro_radps - lin.bg_radps
+    turn = np.linalg.norm(np.gradient(gyro, signal.t_s, axis=0), axis=1)
+    size = np.linalg.norm(gyro, axis=1)
+    # What of the force is not constant in the body: the constant part is the bias state's.
+    moving = np.linalg.norm(signal.acc_mps2 - np.median(signal.acc_mps2, axis=0), axis=1)
+    arm_m = s.lever_arm_sd_mm * 1e-3
+
+    points = t_s[:-1] + np.diff(t_s, axis=0) * ((np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS)[:, None]
+
+    def at(values: FloatArray, shift_s: float) -> FloatArray:
+        return np.asarray(np.interp(points + shift_s, signal.t_s, values).mean(axis=0))
+
+    lost = signal.in_gap(points, least_periods=_ONE_MISSING)
+    fill = signal.samples.fill
+    filled = np.zeros(lost.shape, dtype=np.bool_) if fill is None else fill.covers(points)
+    gap = hold * (lost & ~filled).mean(axis=0)
+    fill_gyro, fill_acc = (0.0, 0.0) if fill is None else (fill.gyro_density, fill.acc_density)
+    bridged = period * signal.in_gap(points).mean(axis=0)
+    gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
+    shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
+    acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2
+    gyro_rough = np.maximum(signal.gyro_roughness_radps**2 - s.gyro_noise_radps**2, 0.0)
+    acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
+    acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2
+    return NoiseParts(
+        gyro_fixed=at(gyro_fixed * period, 0.0)
+        + bridged * at(signal.gyro_bridge_radps, 0.0) ** 2
+        + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2
+        + filled.mean(axis=0) * fill_gyro,
+        gyro_rough=at(gyro_rough * period, 0.0),
+        gyro_systematic=at((s.gyro_scale_sd * size) ** 2 * hold, 0.0),
+        acc_fixed=at(acc_fixed * period, lin.lag_s)
+        + bridged * at(signal.acc_bridge_mps2, lin.lag_s) ** 2
+        + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2
+        + filled.mean(axis=0) * fill_acc,
+        acc_rough=at(acc_rough * period, lin.lag_s),
+        acc_systematic=at(acc_systematic * hold, lin.lag_s),
+    )
+
+
+def camera_noise(
+    camera: CameraMotion, t_s: FloatArray, lin: Linearisation, settings: FusionSettings
+) -> NoiseParts:
+    """Return the noise that the camera's own sensor adds over the steps between instants of IMU time."""
+    own = replace(lin, bg_radps=camera.bias_radps, lag_s=camera.acc_lag_s(lin.lag_s))
+    return noise_parts(camera.signal, camera.own_s(t_s), own, settings)

@@ -1,0 +1,1 @@
+"""Which light is which LED, in one frame and along a run."""

@@ -1,0 +1,1 @@
+"""The lights of the LEDs in pictures: windows, bright spots, centroids and their uncertainty."""
