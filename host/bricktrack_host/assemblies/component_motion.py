@@ -5,10 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import IntArray
 from bricktrack_common.errors import BricktrackError
-from bricktrack_common.poses import Pose
-from bricktrack_common.rotations import skew
 from bricktrack_host.assemblies.motion import Motion, disagreement
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.rest_pose import RestPose
@@ -198,7 +196,7 @@ def motion_from_rest(track: FusedTrack | OpticalTrack, rest: RestPose) -> Motion
     The covariance holds that of the rest pose too.
     """
     relative = rest.relative(track.R_camera_brick, track.t_camera_brick_mm)
-    covariance = _relative_covariance(relative, track.covariance, rest)
+    covariance = rest.relative_covariance(track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
     return Motion(relative.R, relative.t_mm, covariance, track.flags)
 
 
@@ -212,24 +210,6 @@ def _motion_of(view: View, sample: IntArray, index: IntArray, track: FusedTrack,
     seen = motion_from_rest(track, rest)
     R[rows], t_mm[rows], covariance[rows], flags[rows] = seen.R, seen.t_mm, seen.covariance, seen.flags
     return Motion(R, t_mm, covariance, flags).in_axes(view.pose_brick_layout)
-
-
-def _relative_covariance(relative: Pose, covariance: FloatArray, rest: RestPose) -> FloatArray:
-    """Return the covariance of a pose seen from rest: of the pose, and of the mean that rest is.
-
-    With ``D = X_rest^-1 X``: dtheta = dtheta_X - R_D' dtheta_rest and
-    dt = R_rest' (dt_X - dt_rest) + [t_D]x dtheta_rest.
-    """
-    n = len(relative.R)
-    R_rest_camera = rest.R_camera_rest.T
-    of_pose = np.zeros((6, 6))
-    of_pose[:3, :3], of_pose[3:, 3:] = np.eye(3), R_rest_camera
-    of_rest = np.zeros((n, 6, 6))
-    of_rest[:, :3, :3] = -np.swapaxes(relative.R, 1, 2)
-    of_rest[:, 3:, :3] = skew(relative.t_mm)
-    of_rest[:, 3:, 3:] = -R_rest_camera
-    mean = np.diag(np.concatenate([rest.spread_rad, rest.spread_mm]) ** 2) / rest.n_frames
-    return np.asarray(of_pose @ covariance @ of_pose.T + of_rest @ mean @ np.swapaxes(of_rest, 1, 2))
 
 
 def _both_ways(view: View, motion: Motion) -> tuple[tuple[str, str, Motion], tuple[str, str, Motion]]:

@@ -223,19 +223,14 @@ def six_components(
     result: RunResult, R: FloatArray, t_mm: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return x, y, z, mm, and rotation vector, deg, from rest if there is one, with their deviations."""
-    rotation_sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, :3]
-    if result.rest is None:
-        position_sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, 3:]
-        turn = rvec_from_matrix(R)
-    else:
+    if result.rest is not None:
+        covariance = result.rest.relative_covariance(R, t_mm, covariance)
         moved = result.rest.relative(R, t_mm)
-        R_camera_rest = result.rest.R_camera_rest
-        turned = R_camera_rest.T @ covariance[:, 3:, 3:] @ R_camera_rest
-        position_sd = np.sqrt(np.diagonal(turned, axis1=1, axis2=2))
-        t_mm, turn = moved.t_mm, rvec_from_matrix(moved.R)
+        R, t_mm = moved.R, moved.t_mm
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return (
-        np.concatenate([t_mm, np.rad2deg(turn)], axis=1),
-        np.concatenate([position_sd, np.rad2deg(rotation_sd)], axis=1),
+        np.concatenate([t_mm, np.rad2deg(rvec_from_matrix(R))], axis=1),
+        np.concatenate([sd[:, 3:], np.rad2deg(sd[:, :3])], axis=1),
     )
 
 

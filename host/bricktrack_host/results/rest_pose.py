@@ -8,7 +8,8 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.poses import Pose
-from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
+from bricktrack_host.results.ray_errors import RayErrors
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 MIN_FRAMES = 4  # three steps: a vibrating brick stands still for one step at its turning point, not for three
@@ -37,6 +38,8 @@ class RestPose:
         Standard deviation of single frames about the mean: position in camera axes, rotation in brick axes.
     source : "found" or "given"
         Whether the interval was found by stillness or told.
+    ray_errors : RayErrors or None
+        What the covariance of the run's poses holds of its calibration's rays.
     """
 
     R_camera_rest: FloatArray
@@ -46,6 +49,7 @@ class RestPose:
     spread_mm: FloatArray
     spread_rad: FloatArray
     source: Literal["found", "given"]
+    ray_errors: RayErrors | None = None
 
     def relative(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> Pose:
         """Return the pose of the brick seen from its own rest pose, in the brick's axes at rest.
@@ -61,6 +65,40 @@ class RestPose:
             R_rest_camera @ pose_camera_brick.R,
             (pose_camera_brick.t_mm - self.t_camera_rest_mm) @ R_rest_camera.T,
         )
+
+    def relative_covariance(
+        self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray, covariance: FloatArray
+    ) -> FloatArray:
+        """Return the covariance, shape (n, 6, 6), of poses seen from rest: theirs and the mean's there.
+
+        What the calibration's rays do to both alike drops out; what differs stays. All are of
+        ``[dtheta rad, dt mm]``. With ``D = X_rest^-1 X``: dtheta = dtheta_X - R_D' dtheta_rest and
+        dt = R_rest' (dt_X - dt_rest) + [t_D]x dtheta_rest.
+
+        Parameters
+        ----------
+        R_camera_brick : ndarray, shape (n, 3, 3)
+        t_camera_brick_mm : ndarray, shape (n, 3), mm
+        covariance : ndarray, shape (n, 6, 6)
+            Of these poses in the camera frame.
+        """
+        relative = self.relative(R_camera_brick, t_camera_brick_mm)
+        R_rest_camera = self.R_camera_rest.T
+        of_pose = np.zeros((6, 6))
+        of_pose[:3, :3], of_pose[3:, 3:] = np.eye(3), R_rest_camera
+        of_rest = np.zeros((len(relative.R), 6, 6))
+        of_rest[:, :3, :3] = -np.swapaxes(relative.R, 1, 2)
+        of_rest[:, 3:, :3] = skew(relative.t_mm)
+        of_rest[:, 3:, 3:] = -R_rest_camera
+        mean = np.diag(np.concatenate([self.spread_rad, self.spread_mm]) ** 2) / self.n_frames
+        total = of_rest @ mean @ np.swapaxes(of_rest, 1, 2)
+        if self.ray_errors is not None:
+            A = self.ray_errors.at(Pose(R_camera_brick, t_camera_brick_mm))
+            at_rest = self.ray_errors.at(Pose(self.R_camera_rest[None], self.t_camera_rest_mm[None]))
+            covariance = covariance - A @ np.swapaxes(A, 1, 2)
+            left = of_pose @ A + of_rest @ at_rest
+            total += left @ np.swapaxes(left, 1, 2)
+        return np.asarray(total + of_pose @ covariance @ of_pose.T)
 
 
 def tare(

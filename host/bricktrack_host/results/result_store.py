@@ -7,7 +7,7 @@ processed again gives the same bytes.
 import hashlib
 import importlib.metadata
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,10 +20,12 @@ import pyarrow.parquet
 from bricktrack_common.arrays import IntArray
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import RunFormatError
+from bricktrack_common.poses import Pose
 from bricktrack_common.run_manifest import MANIFEST_NAME, RunManifest
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_host.durable_files import kept_beside, write_folder_whole
 from bricktrack_host.results.daq_clock import EdgeFit, fit_edges
+from bricktrack_host.results.ray_errors import RayErrors
 from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.results.result_tables import (
     CONVENTIONS,
@@ -40,7 +42,7 @@ from bricktrack_host.results.result_tables import (
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
 RESULTS_SCHEMA = "bricktrack.results"
-RESULTS_VERSION = 1
+RESULTS_VERSION = 2
 RESULTS_FOLDER = "results"
 SUMMARY_NAME = "summary.json"
 REPORT_NAME = "report.html"
@@ -123,6 +125,13 @@ class RunResult:
         return self.manifest.trigger.t0_ns
 
 
+class _RayErrorsEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    rotation_camera_brick: list[list[float]]
+    position_camera_mm: list[float]
+    factor: list[list[float]]
+    slopes: list[list[list[float]]]
+
+
 class _RestEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     rotation_camera_rest: list[list[float]]
     position_camera_mm: list[float]
@@ -131,6 +140,7 @@ class _RestEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     spread_mm: list[float]
     spread_rad: list[float]
     source: Literal["found", "given"]
+    ray_errors: _RayErrorsEntry | None = None
 
 
 class _Summary(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -358,6 +368,7 @@ def read_parquet(path: Path) -> "pa.Table":
 
 
 def _table_metadata(result: RunResult) -> dict[str, str]:
+    rest = None if result.rest is None else replace(result.rest, ray_errors=None)  # long, and in the summary
     metadata = {f"bricktrack.{name.replace(' ', '_')}": words for name, words in CONVENTIONS.items()}
     metadata |= {
         "bricktrack.schema": RESULTS_SCHEMA,
@@ -366,7 +377,7 @@ def _table_metadata(result: RunResult) -> dict[str, str]:
         "bricktrack.unit": result.manifest.unit,
         "bricktrack.simulated": "true" if result.manifest.simulated else "false",
         "bricktrack.trigger_ns": "none" if result.t0_ns is None else str(result.t0_ns),
-        "bricktrack.rest_pose": msgspec.json.encode(_rest_entry(result.rest)).decode(),
+        "bricktrack.rest_pose": msgspec.json.encode(_rest_entry(rest)).decode(),
         "bricktrack.provenance": msgspec.json.encode(result.provenance).decode(),
     }
     return metadata
@@ -383,6 +394,16 @@ def _rest_entry(rest: RestPose | None) -> _RestEntry | None:
         spread_mm=rest.spread_mm.tolist(),
         spread_rad=rest.spread_rad.tolist(),
         source=rest.source,
+        ray_errors=None if rest.ray_errors is None else _ray_errors_entry(rest.ray_errors),
+    )
+
+
+def _ray_errors_entry(errors: RayErrors) -> _RayErrorsEntry:
+    return _RayErrorsEntry(
+        rotation_camera_brick=errors.about.R.tolist(),
+        position_camera_mm=errors.about.t_mm.tolist(),
+        factor=errors.factor.tolist(),
+        slopes=errors.slopes.tolist(),
     )
 
 
@@ -397,7 +418,13 @@ def _rest_pose(entry: _RestEntry | None) -> RestPose | None:
         spread_mm=np.array(entry.spread_mm),
         spread_rad=np.array(entry.spread_rad),
         source=entry.source,
+        ray_errors=None if entry.ray_errors is None else _ray_errors(entry.ray_errors),
     )
+
+
+def _ray_errors(entry: _RayErrorsEntry) -> RayErrors:
+    about = Pose(np.array(entry.rotation_camera_brick), np.array(entry.position_camera_mm))
+    return RayErrors(about, np.array(entry.factor), np.array(entry.slopes))
 
 
 def _square_wave(fit: EdgeFit | None) -> Details | None:

@@ -229,11 +229,11 @@ def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest:
     q = continuous_quaternions(quaternion_from_matrix(R))
     if rest is None:
         R_rest, d_mm = np.full_like(R, np.nan), np.full_like(t_mm, np.nan)
-        d_cov = np.full_like(covariance[:, 3:, 3:], np.nan)
+        d_cov = np.full_like(covariance, np.nan)
     else:
         relative = rest.relative(R, t_mm)
         R_rest, d_mm = relative.R, relative.t_mm
-        d_cov = rest.R_camera_rest.T @ covariance[:, 3:, 3:] @ rest.R_camera_rest
+        d_cov = rest.relative_covariance(R, t_mm, covariance)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     d_sd = np.sqrt(np.diagonal(d_cov, axis1=1, axis2=2))
     return [
@@ -258,9 +258,17 @@ def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest:
             np.rad2deg(angles_xyz_from_matrix(R_rest)),
         ),
         *vector_columns("sd_{}_mm", "mm", "standard deviation of the position, camera axes", sd[:, 3:]),
-        *vector_columns("sd_d{}_mm", "mm", "standard deviation of the position, brick axes at rest", d_sd),
+        *vector_columns(
+            "sd_d{}_mm", "mm", "standard deviation of the displacement, brick axes at rest", d_sd[:, 3:]
+        ),
         *vector_columns(
             "sd_rot_{}_deg", "deg", "standard deviation of the rotation, brick axes", np.rad2deg(sd[:, :3])
+        ),
+        *vector_columns(
+            "sd_drot_{}_deg",
+            "deg",
+            "standard deviation of the rotation from rest, brick axes",
+            np.rad2deg(d_sd[:, :3]),
         ),
         covariance_column(covariance),
     ]

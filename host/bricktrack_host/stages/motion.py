@@ -8,6 +8,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
+from bricktrack_common.poses import Pose
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import BRIDGE_PERIODS, seconds_since
@@ -17,6 +18,7 @@ from bricktrack_host.fusion.optical.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.pose_by_pose.fused_output import unsure_times
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.results.daq_clock import EdgeFit
+from bricktrack_host.results.ray_errors import RayErrors
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.stages.clocks import Inertial
 from bricktrack_host.tracking.optical_track import solve_poses
@@ -202,6 +204,25 @@ def _fuse_tight(
             f"{100 * tight.check.share_apart:.0f} % of the instants by more than their uncertainty allows"
         )
     return tight.fused
+
+
+def with_ray_errors(
+    optical: OpticalTrack, fused: dict[FusedKind, FusedTrack], errors: RayErrors | None
+) -> tuple[OpticalTrack, dict[FusedKind, FusedTrack]]:
+    """Return the poses with what the calibration's rays leave unsure in their covariance.
+
+    It is added last: all frames share it, so to a fusion that takes its frames as independent it is nothing.
+    """
+    if errors is None:
+        return optical, fused
+
+    def of(track: OpticalTrack | FusedTrack) -> FloatArray:
+        return errors.covariance(Pose(track.R_camera_brick, track.t_camera_brick_mm))
+
+    return (
+        replace(optical, covariance=optical.covariance + of(optical)),
+        {kind: replace(track, covariance=track.covariance + of(track)) for kind, track in fused.items()},
+    )
 
 
 def with_unsure_times(

@@ -1,20 +1,26 @@
 """From the LEDs seen to all that the results hold: poses, clocks, motion."""
 
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import TrackingError
+from bricktrack_common.poses import Pose
 from bricktrack_common.run_folder import Run
 from bricktrack_common.run_manifest import MANIFEST_NAME
 from bricktrack_host.calibration.calibration_file import Calibration
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting.fusion_check import TwoFusions
+from bricktrack_host.results.ray_errors import ray_errors
+from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.results.result_store import Provenance, RunResult, software_version
 from bricktrack_host.stages.clocks import align, choose_imu, fit_square_wave, rest_pose, unsure_stamps
 from bricktrack_host.stages.details import alignment_details, calibration_details
-from bricktrack_host.stages.motion import fuse_run, output_grid, retime, with_unsure_times
+from bricktrack_host.stages.motion import fuse_run, output_grid, retime, with_ray_errors, with_unsure_times
 from bricktrack_host.stages.progress import Stages
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
@@ -89,6 +95,14 @@ def solve_run(
         seen = (observations, rays) if settings.rolling_shutter else None
         fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
         optical, fused = with_unsure_times(optical, fused, time_sd_ns)
+        errors_of_rays = ray_errors(calibration.ray_model, brick, _pose_at_rest(optical, rest))
+        if errors_of_rays is None:
+            problems.append(
+                "where the brick stood, fewer than four LEDs lie in the picture: the standard deviations hold "
+                "nothing of the calibration's own"
+            )
+        optical, fused = with_ray_errors(optical, fused, errors_of_rays)
+        rest = None if rest is None else replace(rest, ray_errors=errors_of_rays)
     result = RunResult(
         manifest=run.manifest,
         led_names=brick.led_names,
@@ -114,6 +128,16 @@ def solve_run(
     if fusion is None or fusion.pose_level is None:
         return result, None
     return result, TwoFusions(fusion.track, fusion.pose_level)
+
+
+def _pose_at_rest(optical: OpticalTrack, rest: RestPose | None) -> Pose:
+    """Return the pose at rest, or one from the middle of a run that was never still."""
+    if rest is not None:
+        return Pose(rest.R_camera_rest, rest.t_camera_rest_mm)
+    posed = np.flatnonzero(all_finite(optical.t_camera_brick_mm))
+    t_mm = optical.t_camera_brick_mm[posed]
+    middle = posed[np.linalg.norm(t_mm - np.median(t_mm, axis=0), axis=1).argmin()]
+    return Pose(optical.R_camera_brick[middle], optical.t_camera_brick_mm[middle])
 
 
 def _require_poses(optical: OpticalTrack, run: Run, brick: BrickModel) -> None:

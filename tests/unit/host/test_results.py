@@ -14,8 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import RunFormatError, StorageError, TrackingError
+from bricktrack_common.poses import Pose
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results import result_store as results_module
+from bricktrack_host.results.ray_errors import RayErrors
 from bricktrack_host.results.rest_pose import tare
 from bricktrack_host.results.result_store import earlier_results, read_result, results_id, write_results
 from bricktrack_host.tracks import OpticalTrack
@@ -35,7 +37,11 @@ example = load_example()
 
 @pytest.fixture(scope="module")
 def result():
-    return example.example_result()
+    made = example.example_result()
+    rng = np.random.default_rng(4)
+    about = Pose(made.rest.R_camera_rest, made.rest.t_camera_rest_mm)
+    errors = RayErrors(about, rng.normal(0, 1e-6, (6, 3)), rng.normal(0, 1e-8, (6, 6, 3)))
+    return replace(made, rest=replace(made.rest, ray_errors=errors))
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +51,8 @@ def folder(result, tmp_path_factory):
     return path
 
 
-def test_processing_again_gives_the_same_bytes_whatever_the_time_it_took(folder, tmp_path):
-    again = replace(example.example_result(), timings_s={"decode": 1234.5})
+def test_processing_again_gives_the_same_bytes_whatever_the_time_it_took(result, folder, tmp_path):
+    again = replace(result, timings_s={"decode": 1234.5})
     write_results(again, tmp_path / "results")
     names = {p.name for p in folder.iterdir()}
     assert names == {p.name for p in (tmp_path / "results").iterdir()}
@@ -82,6 +88,10 @@ def test_everything_comes_back(result, folder):
     np.testing.assert_array_equal(result.edge_index, back.edge_index)
     np.testing.assert_array_equal(result.imu.gyro_radps, back.imu.gyro_radps)
     np.testing.assert_array_equal(result.rest.R_camera_rest, back.rest.R_camera_rest)
+    for name in ("factor", "slopes"):
+        np.testing.assert_array_equal(
+            getattr(result.rest.ray_errors, name), getattr(back.rest.ray_errors, name)
+        )
     assert back.edge_fit.period_ns == result.edge_fit.period_ns
     assert back.manifest == result.manifest
     assert back.provenance == result.provenance
@@ -253,7 +263,7 @@ def test_a_folder_of_something_else_is_left_alone(result, tmp_path):
         (lambda f: (f / "summary.json").unlink(), "no summary.json"),
         (lambda f: (f / "leds.parquet").unlink(), "missing"),
         (lambda f: (f / "fused.parquet").write_bytes(b"PAR1 not"), "not a readable"),
-        (lambda f: (f / "summary.json").write_text('{"schema": "bricktrack.results", "version": 99}'), "up to version 1"),
+        (lambda f: (f / "summary.json").write_text('{"schema": "bricktrack.results", "version": 99}'), "up to version 2"),
         (lambda f: (f / "summary.json").write_text('{"schema": "other"}'), "not a bricktrack.results"),
     ],
 )  # fmt: skip

@@ -148,7 +148,8 @@ class CentralRays(UncertainRays):
         """Tell for pixels, shape (..., 2), whether dots of any plane surrounded them."""
         return self.region.contains(uv_px)
 
-    def _rows(self, uv_px: FloatArray, z_mm: FloatArray) -> FloatArray:
+    def point_derivatives(self, uv_px: FloatArray, z_mm: FloatArray) -> FloatArray:
+        """Return d(x, y) / d parameters, shape (n, 2, p), see `UncertainRays`."""
         st = self._scaling.scaled(uv_px)
         V = legendre_terms(st, self.covariance_order)
         return (

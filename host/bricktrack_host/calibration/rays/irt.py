@@ -151,7 +151,8 @@ class TwoPlaneIrt(UncertainRays):
         """Tell for pixels, shape (..., 2), whether dots surrounded them at both planes."""
         return self.region_a.contains(uv_px) & self.region_b.contains(uv_px)
 
-    def _rows(self, uv_px: FloatArray, z_mm: FloatArray) -> FloatArray:
+    def point_derivatives(self, uv_px: FloatArray, z_mm: FloatArray) -> FloatArray:
+        """Return d(x, y) / d parameters, shape (n, 2, p), see `UncertainRays`."""
         V = legendre_terms(self._scaling.scaled(uv_px), self.covariance_order)
         return two_plane_rows(V, z_mm, a_mm=self.plane_a_mm, b_mm=self.plane_b_mm)
 

@@ -24,8 +24,11 @@ class UncertainRays(ABC):
     plane_b_mm: float
 
     @abstractmethod
-    def _rows(self, uv_px: FloatArray, z_mm: FloatArray) -> FloatArray:
-        """Return d(x, y) / d parameters, shape (n, 2, p), of pixels, shape (n, 2), at depths, shape (n,)."""
+    def point_derivatives(self, uv_px: FloatArray, z_mm: FloatArray) -> FloatArray:
+        """Return d(x, y) / d parameters, shape (n, 2, p), of pixels, shape (n, 2), at depths, shape (n,).
+
+        The parameters are those that `covariance` is of.
+        """
 
     def point_covariance_mm2(self, uv_px: ArrayLike, z_mm: ArrayLike) -> FloatArray:
         """Return the covariance, shape (..., 2, 2), mm^2, of the points that pixels (..., 2) see on plane z.
@@ -39,7 +42,7 @@ class UncertainRays(ABC):
         z = np.broadcast_to(np.asarray(z_mm, dtype=np.float64), shape).reshape(-1)
         covariance = np.empty((len(uv), 2, 2))
         for piece in in_chunks(len(uv)):
-            rows = self._rows(uv[piece], z[piece])
+            rows = self.point_derivatives(uv[piece], z[piece])
             covariance[piece] = (rows @ self.covariance) @ np.swapaxes(rows, 1, 2)
         return covariance.reshape(*shape, 2, 2)
 
@@ -58,7 +61,11 @@ class UncertainRays(ABC):
         for piece in in_chunks(len(uv)):
             n = len(uv[piece])
             rows = np.concatenate(
-                [self._rows(uv[piece], np.full(n, z)) for z in (self.plane_a_mm, self.plane_b_mm)], axis=1
+                [
+                    self.point_derivatives(uv[piece], np.full(n, z))
+                    for z in (self.plane_a_mm, self.plane_b_mm)
+                ],
+                axis=1,
             )
             covariance[piece] = (rows @ self.covariance) @ np.swapaxes(rows, 1, 2)
         return covariance.reshape(*shape, 4, 4)

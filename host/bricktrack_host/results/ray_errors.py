@@ -1,0 +1,108 @@
+"""What the calibration's rays leave unsure in poses: one error that a whole run shares.
+
+The dots of a calibration are few and noisy, so its rays are off by a little, the same way in every frame.
+No residual of the run shows that. To first order a pose is off by ``[dtheta, dt] = A(pose) n`` with n
+standard normal, drawn once for a run. A changes slowly with the pose, so displacements from rest are off by
+much less.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bricktrack_common.arrays import FloatArray
+from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.poses import Pose
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
+from bricktrack_host.calibration.rays.central_rays import CentralRays
+from bricktrack_host.calibration.rays.irt import TwoPlaneIrt
+
+# Far enough that differences are not rounding, near enough that they are straight: a shake's own size.
+_STEP = np.repeat([0.02, 2.0], 3)  # rad, mm
+_LEAST_LEDS = 4
+_LEAST_SHARE = 1e-4  # of the greatest variance; less than that is not kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayErrors:
+    """Errors of all poses of a run for which its calibration's rays are to blame.
+
+    Attributes
+    ----------
+    about : Pose
+        Of the brick in the camera frame, about which the errors were taken.
+    factor : ndarray, shape (6, m)
+        ``A`` there, of ``[dtheta rad, dt mm]``: ``R_true = R Exp(dtheta)``, ``t_true = t + dt``.
+    slopes : ndarray, shape (6, 6, m)
+        Change of ``A`` by each coordinate of the pose from there: turned by rad about brick axes, moved by mm
+        along camera axes.
+    """
+
+    about: Pose
+    factor: FloatArray
+    slopes: FloatArray
+
+    def at(self, pose: Pose) -> FloatArray:
+        """Return ``A``, shape (n, 6, m), at poses (n,) of the brick in the camera frame."""
+        turn = rvec_from_matrix(self.about.R.T @ pose.R)
+        away = np.concatenate([turn, pose.t_mm - self.about.t_mm], axis=1)
+        return np.asarray(self.factor + np.einsum("ni,ijm->njm", away, self.slopes))
+
+    def covariance(self, pose: Pose) -> FloatArray:
+        """Return the covariance, shape (n, 6, 6), of ``[dtheta rad, dt mm]`` of poses (n,); NaN of NaN."""
+        A = self.at(pose)
+        return np.asarray(A @ np.swapaxes(A, 1, 2))
+
+
+def ray_errors(rays: CentralRays | TwoPlaneIrt, brick: BrickModel, about: Pose) -> RayErrors | None:
+    """Return what a calibration's covariance means for poses near one; `None` where it cannot be told.
+
+    Poses are those that fit the LEDs in the picture best, by least squares of pixels.
+
+    Parameters
+    ----------
+    rays : CentralRays or TwoPlaneIrt
+    brick : BrickModel
+    about : Pose
+        Of the brick in the camera frame, as at rest.
+    """
+    mode = rays.sensor_mode
+    uv_px = rays.project(about.apply(brick.led_positions_mm)).uv_px
+    inside = np.asarray(((uv_px >= 0) & (uv_px <= [mode.width - 1, mode.height - 1])).all(axis=1))
+    if np.count_nonzero(inside) < _LEAST_LEDS:
+        return None
+    leds_mm = brick.led_positions_mm[inside]
+    by_rays = _by_rays(rays, leds_mm, about)
+    slopes = []
+    for step in np.diag(_STEP):
+        ahead, behind = (_by_rays(rays, leds_mm, _moved(about, side * step)) for side in (1.0, -1.0))
+        slopes.append((ahead - behind) / 2)
+    stacked = np.stack([by_rays, *slopes])  # slopes as steps, so that rows compare in size
+    if not np.isfinite(stacked).all():
+        return None
+    stacked = stacked.reshape(42, -1)
+    in_units = np.tile(1 / _STEP, 7)[:, None]
+    values, vectors = np.linalg.eigh((in_units * stacked) @ rays.covariance @ (in_units * stacked).T)
+    kept = values > _LEAST_SHARE * values[-1]
+    factors = (vectors[:, kept] * np.sqrt(values[kept]) / in_units).reshape(7, 6, -1)
+    return RayErrors(about, factors[0], factors[1:] / _STEP[:, None, None])
+
+
+def _moved(pose: Pose, step: FloatArray) -> Pose:
+    return Pose(pose.R @ matrix_from_rvec(step[:3]), pose.t_mm + step[3:])
+
+
+def _by_rays(rays: CentralRays | TwoPlaneIrt, leds_mm: FloatArray, pose: Pose) -> FloatArray:
+    """Return the derivative, shape (6, p), of the error of a pose by the parameters of the rays.
+
+    A ray that truly passes at e beside where it is believed lets its LED appear where one at -e would be
+    believed: ``J [dp/dtheta, dp/dt] [dtheta, dt] = J_xy e`` in pixels, for all LEDs by least squares.
+    """
+    points_mm = pose.apply(leds_mm)
+    seen = rays.project(points_mm)
+    J = seen.J_px_per_mm
+    by_pose = np.concatenate([-J @ (pose.R @ skew(leds_mm)), J], axis=2).reshape(-1, 6)
+    by_rays = J[:, :, :2] @ rays.point_derivatives(seen.uv_px, points_mm[:, 2])
+    if not np.isfinite(by_pose).all():
+        return np.full((6, by_rays.shape[2]), np.nan)
+    return np.asarray(np.linalg.pinv(by_pose * _STEP) @ by_rays.reshape(len(by_pose), -1) * _STEP[:, None])
