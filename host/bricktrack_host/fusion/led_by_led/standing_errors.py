@@ -19,7 +19,7 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import Pictured, SeenLeds
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
-from bricktrack_host.fusion.smoothing.sensor_errors import N_ERRORS, SensorErrors
+from bricktrack_host.fusion.smoothing.sensor_errors import N_ERRORS, SensorErrors, root_of
 from bricktrack_host.fusion.smoothing.smoother import N_STATES, POS, Estimate, Filter, Problem
 from bricktrack_host.fusion.smoothing.standing_errors_kernel import carry_back, carry_forward
 from bricktrack_host.tracking.pose.refine import OWN_SHARE
@@ -171,11 +171,12 @@ class StandingWay:
         # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
         at = np.searchsorted(self._of, np.arange(POS.start, POS.stop))[:, None]
         changed[:, at, np.arange(_ARM.start, _ARM.stop)] -= self._R
-        more = changed @ errors.covariance @ np.swapaxes(changed, 1, 2)
+        doubt = changed @ root_of(errors.covariance)
+        more = doubt @ np.swapaxes(doubt, 1, 2)
         covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
         covariance[:, 0] += more
         variance[:, 0, self._of] += np.diagonal(more, axis1=1, axis2=2)
-        return replace(estimate, covariance=covariance, variance=variance)
+        return replace(estimate, covariance=covariance, variance=variance, doubt=doubt[:, None])
 
 
 def _own_part(problem: Problem, leds: SeenLeds, pictured: Pictured, n_leds: int) -> FloatArray:

@@ -16,6 +16,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import skew
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.smoothing.camera_errors import ACC, ARM, GYRO, CameraErrors, CameraWay
 from bricktrack_host.fusion.smoothing.sensor_errors_kernel import carry_back, carry_forward
 from bricktrack_host.fusion.smoothing.smoother import (
     BG,
@@ -43,14 +44,17 @@ class SensorErrors:
         Sample = (1 + this) @ truth, to first order.
     arm_m : ndarray, shape (3,), brick axes
         True lever arm less the one given.
-    covariance : ndarray, shape (21, 21)
-        Of gyro and acc, row by row, and arm_m.
+    covariance : ndarray, shape (21, 21), or (42, 42) where the camera moves
+        Of gyro and acc, row by row, and arm_m; and of the camera's sensor in the same order.
+    camera : CameraErrors or None
+        Of the sensor that moves with the camera.
     """
 
     gyro: FloatArray
     acc: FloatArray
     arm_m: FloatArray
     covariance: FloatArray
+    camera: CameraErrors | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +75,9 @@ class _Way:
     dy: FloatArray
 
 
-def _way(problem: Problem, passed: Filter, b: int, *, of: IntArray) -> _Way:
+def _way(
+    problem: Problem, passed: Filter, b: int, *, of: IntArray, camera: CameraWay | None = None
+) -> _Way:
     at = np.flatnonzero(problem.has_frame[:, b])
     before = passed.predicted(at, b, of=of)
     R, x = before.R[at], before.x
@@ -85,13 +91,22 @@ def _way(problem: Problem, passed: Filter, b: int, *, of: IntArray) -> _Way:
     own = np.zeros((len(at), 6, N_ERRORS))
     turn = problem.omega_radps[at, b] - x[:, BG]
     own[:, 3:, _ARM] = R + R @ skew(turn) * ahead[:, None, None]
+    further = np.zeros((len(problem.dt_s), 3, 0))
+    if camera is not None:
+        own = np.concatenate([own, camera.of_frames(problem, R, at, b)], axis=2)
+        further = np.ascontiguousarray(camera.velocity)
     H = np.ascontiguousarray(H)
-    changed, dy = carry_forward(passed.runs[b], at, before.R, H, gain, own, of)
+    changed, dy = carry_forward(passed.runs[b], at, before.R, H, gain, own, further, of)
     return _Way(at, before.R, before.rows, y, H, S, gain, changed, dy)
 
 
 def estimate_sensor_errors(
-    problem: Problem, passed: Filter, b: int, settings: FusionSettings
+    problem: Problem,
+    passed: Filter,
+    b: int,
+    settings: FusionSettings,
+    *,
+    R_still_camera: FloatArray | None = None,
 ) -> SensorErrors | None:
     """Return the errors that make the innovations of a forward pass least, or None where none are believed.
 
@@ -101,41 +116,70 @@ def estimate_sensor_errors(
         Of frames.
     b : int
         The run's place in the batch.
+    R_still_camera : ndarray, shape (K, 3, 3), optional
+        Attitudes of a moving camera at the run's nodes.
     """
+    camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, b)
     prior_sd = np.repeat([settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3], [18, 3])
+    prior_sd = np.tile(prior_sd, 1 if camera is None else 2)
     believed = prior_sd > 0
     if not believed.any() or not problem.has_frame[:, b].any():
         return None
-    way = _way(problem, passed, b, of=np.zeros(0, dtype=np.int64))
+    way = _way(problem, passed, b, of=np.zeros(0, dtype=np.int64), camera=camera)
     dy = way.dy[..., believed]
     weighted = np.linalg.solve(way.S, dy)
     normal = np.einsum("nij,nik->jk", dy, weighted) + np.diag(prior_sd[believed] ** -2)
-    errors, covariance = np.zeros(N_ERRORS), np.zeros((N_ERRORS, N_ERRORS))
+    errors, covariance = np.zeros(len(prior_sd)), np.zeros((len(prior_sd), len(prior_sd)))
     covariance[np.ix_(believed, believed)] = np.linalg.inv(normal)
     errors[believed] = -np.linalg.solve(normal, np.einsum("nij,ni->j", weighted, way.y))
     gyro, acc = errors[_GAINS].reshape(2, 3, 3)
-    return SensorErrors(gyro, acc, errors[_ARM], covariance)
+    found = SensorErrors(gyro, acc, errors[_ARM], covariance)
+    if camera is None:
+        return found
+    theirs = errors[N_ERRORS:]
+    gyro, acc = theirs[GYRO].reshape(3, 3), theirs[ACC].reshape(3, 3)
+    return replace(found, camera=CameraErrors(gyro, acc, theirs[ARM]))
 
 
 def with_sensor_doubt(
-    problem: Problem, passed: Filter, estimate: Estimate, sensor_covariance: list[FloatArray]
+    problem: Problem,
+    passed: Filter,
+    estimate: Estimate,
+    sensor_covariance: list[FloatArray],
+    *,
+    R_still_camera: list[FloatArray | None] | None = None,
 ) -> Estimate:
     """Return smoothed states with what the errors of the sensors leave unsure added to their covariance.
 
-    ``sensor_covariance``: of each run of the batch, shape (21, 21); zero where all is known.
+    ``sensor_covariance``: of each run of the batch, shape (21, 21), or (42, 42) where the camera moves; zero
+    where all is known. ``R_still_camera``: as `estimate_sensor_errors`, of each run whose camera moves.
     """
     covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
+    doubt = np.zeros((*covariance.shape[:3], N_ERRORS))
     for b, unsure in enumerate(sensor_covariance):
         if not unsure.any():
             continue
-        way = _way(problem, passed, b, of=estimate.of)
+        still = None if R_still_camera is None else R_still_camera[b]
+        camera = None if still is None else CameraWay.of(problem, still, b)
+        way = _way(problem, passed, b, of=estimate.of, camera=camera)
         weighted = np.linalg.solve(way.S, way.dy)
         changed = way.changed
         carry_back(passed.runs[b], way.at, way.R, way.H, way.gain, weighted, way.rows, changed)
         # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
         at_arm = np.arange(_ARM.start, _ARM.stop)
         changed[:, np.searchsorted(estimate.of, np.arange(POS.start, POS.stop))[:, None], at_arm] -= way.R
-        more = changed @ unsure @ np.swapaxes(changed, 1, 2)
+        if camera is not None:
+            changed[:, :, N_ERRORS:] += camera.of_output(
+                estimate.state.R[:, b], estimate.state.x[:, b, POS], estimate.of
+            )
+        doubt[:, b] = changed @ root_of(unsure)
+        more = doubt[:, b] @ np.swapaxes(doubt[:, b], 1, 2)
         covariance[:, b] += more
         variance[:, b, estimate.of] += np.diagonal(more, axis1=1, axis2=2)
-    return replace(estimate, covariance=covariance, variance=variance)
+    return replace(estimate, covariance=covariance, variance=variance, doubt=doubt)
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Return A with A A^T = covariance, which may lack rank; shape (q, q)."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

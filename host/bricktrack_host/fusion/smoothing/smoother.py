@@ -127,6 +127,9 @@ class Estimate:
         Innovation squared over its covariance (6 degrees of freedom), NaN where no frame; only of the filter.
     led_residual_px, led_cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
         Of each LED at the state of its node: seen less predicted, and H P H^T; empty where there are no LEDs.
+    doubt : ndarray, shape (K, B, c, q), or None
+        Of errors that stand still, in q independent parts, where ``covariance`` holds them too: what one sd of
+        each moves the states ``of`` by, over the whole run.
     """
 
     state: State
@@ -136,6 +139,7 @@ class Estimate:
     nis: FloatArray
     led_residual_px: FloatArray
     led_cov_px2: FloatArray
+    doubt: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
