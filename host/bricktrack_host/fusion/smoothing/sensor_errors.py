@@ -155,7 +155,7 @@ def with_sensor_doubt(
     where all is known. ``R_still_camera``: as `estimate_sensor_errors`, of each run whose camera moves.
     """
     covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
-    doubt = np.zeros((*covariance.shape[:3], N_ERRORS))
+    doubt = np.zeros((*covariance.shape[:3], max(len(unsure) for unsure in sensor_covariance)))
     for b, unsure in enumerate(sensor_covariance):
         if not unsure.any():
             continue
@@ -172,8 +172,9 @@ def with_sensor_doubt(
             changed[:, :, N_ERRORS:] += camera.of_output(
                 estimate.state.R[:, b], estimate.state.x[:, b, POS], estimate.of
             )
-        doubt[:, b] = changed @ root_of(unsure)
-        more = doubt[:, b] @ np.swapaxes(doubt[:, b], 1, 2)
+        of_run = changed @ root_of(unsure)
+        doubt[:, b, :, : len(unsure)] = of_run
+        more = of_run @ np.swapaxes(of_run, 1, 2)
         covariance[:, b] += more
         variance[:, b, estimate.of] += np.diagonal(more, axis1=1, axis2=2)
     return replace(estimate, covariance=covariance, variance=variance, doubt=doubt)

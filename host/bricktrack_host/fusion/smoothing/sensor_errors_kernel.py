@@ -1,6 +1,7 @@
 """How the filter's states and innovations depend on errors of the sensor that stand still: compiled loops.
 
-The errors are those of `sensor_errors.SensorErrors`: 9 of the gyro, 9 of the accelerometer, 3 of the arm.
+The errors are those of `sensor_errors.SensorErrors`: 9 of the gyro, 9 of the accelerometer, 3 of the arm; and
+after these whatever else is given by what it does in each step and to each frame.
 """
 
 from typing import Any
@@ -13,6 +14,7 @@ from bricktrack_host.fusion.smoothing.transition_kernel import RunArrays, transi
 
 _N = 22
 _MOVING = 9
+_OWN_ERRORS = 21
 
 
 @compiled
@@ -31,8 +33,17 @@ def drive(run: RunArrays, k: int, R: Any, now: Any) -> None:
 
 
 @compiled
+def _drive_further(h: float, further: Any, now: Any) -> None:
+    """Add what errors beside the sensor's own do to the velocity, shape (3, c), and so to the position."""
+    for r in range(3):
+        for c in range(further.shape[1]):
+            now[6 + r, _OWN_ERRORS + c] += further[r, c]
+            now[3 + r, _OWN_ERRORS + c] += 0.5 * h * further[r, c]
+
+
+@compiled
 def carry_forward(
-    run: RunArrays, at: Any, R: Any, H: Any, gain: Any, own: Any, of: Any
+    run: RunArrays, at: Any, R: Any, H: Any, gain: Any, own: Any, further: Any, of: Any
 ) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of predicted states (K, c, q) and of innovations (n, 6, q) by the errors.
 
@@ -46,6 +57,8 @@ def carry_forward(
         The states that are wanted.
     H, gain, own : ndarray, shape (n, 6, 22), (n, 22, 6), (n, 6, q)
         Of the frames; the last is what an error changes of the innovation by itself.
+    further : ndarray, shape (K - 1, 3, q - 21), m/s
+        What the errors beyond the sensor's own change of the velocity in each step.
     """
     n_nodes, q = len(R), own.shape[2]
     predicted, dy = np.zeros((n_nodes, len(of), q)), np.zeros((len(at), 6, q))
@@ -56,6 +69,7 @@ def carry_forward(
             transition(run, k - 1, R[k - 1], F)
             now[:_MOVING] = F @ now
             drive(run, k - 1, R[k - 1], now)
+            _drive_further(run.dt_s[k - 1], further[k - 1], now)
         for c in range(len(of)):
             predicted[k, c] = now[of[c]]
         if frame < len(at) and at[frame] == k:
