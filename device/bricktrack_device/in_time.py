@@ -8,6 +8,8 @@ from typing import TypeVar
 from bricktrack_common.errors import HardwareError
 
 _POLL_S = 0.01
+_GIVE_UP_S = 5.0
+"""How long a call that is given up may still take to return: what comes next must not meet it half-way."""
 
 T = TypeVar("T")
 
@@ -20,7 +22,7 @@ def in_time(what: str, call: Callable[[], T], timeout_s: float, *, beat: Callabl
     what : str
         Names the thread, and stands in the error.
     beat : callable
-        Called while waiting; raises to give up.
+        Called while waiting; raises to give up. The call is then let come to its end, where it soon does.
 
     Raises
     ------
@@ -41,9 +43,13 @@ def in_time(what: str, call: Callable[[], T], timeout_s: float, *, beat: Callabl
     thread = threading.Thread(target=run, name=f"camera-{what}", daemon=True)
     thread.start()
     deadline = time.monotonic() + timeout_s
-    while thread.is_alive() and time.monotonic() < deadline:
-        beat()
-        thread.join(_POLL_S)
+    try:
+        while thread.is_alive() and time.monotonic() < deadline:
+            beat()
+            thread.join(_POLL_S)
+    except BaseException:
+        thread.join(_GIVE_UP_S)
+        raise
     if errors:
         raise errors[0]
     if not results:

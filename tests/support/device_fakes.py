@@ -127,12 +127,15 @@ class FakeBusOpener:
     """Picklable, as an opener must be."""
 
     present: bool = True
+    hang_at_opening: bool = False
     hang_after: int | None = None
     exit_after: int | None = None
     fail_every: int | None = None
     reset_after: int | None = None
 
     def __call__(self) -> I2cBus:
+        if self.hang_at_opening:
+            time.sleep(3600)
         # Called in the sampler's process: there the driver need not wait 0.7 s for a table of registers.
         adafruit_bno055.time = SimpleNamespace(sleep=lambda seconds: None)
         return FakeBus(
@@ -163,7 +166,7 @@ class FakeCamera:
         self.n_stops = 0
         self.picture: Still | None = None
         self.trouble: str | None = None
-        self.stop_error: HardwareError | None = None
+        self.stop_error: Exception | None = None
 
     def start(self, sink: FrameSink) -> CameraSection:
         if self.fail:

@@ -6,6 +6,7 @@ One sensor failing stops no other: it is noted in words, and the run says what i
 import logging
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import TypeVar
 
 from bricktrack_common.clocks import ClockTriplet, monotonic_ns, read_clock_triplet
@@ -350,17 +351,19 @@ class Session:
 
     def close(self) -> None:
         """Let go of every sensor; what hangs is left behind. Calling it twice does no harm."""
-        if self.trigger is not None:
-            self.trigger.close()
-        camera, self._camera = self._camera, None
-        if camera is not None:
-            try:
-                self._in_time("stop", camera.stop, CAMERA_STOP_TIMEOUT_S, give_up=False)
-            except (BricktrackError, OSError) as e:
-                self.lost_camera = str(e)
-                logger.warning("camera: %s", e)
-        for reader in self.imus:
-            reader.stop()
+        with ExitStack() as at_last:
+            # Whatever the others raise: a sampler that nobody ends goes on, and keeps its memory.
+            for reader in self.imus:
+                at_last.callback(reader.stop)
+            if self.trigger is not None:
+                self.trigger.close()
+            camera, self._camera = self._camera, None
+            if camera is not None:
+                try:
+                    self._in_time("stop", camera.stop, CAMERA_STOP_TIMEOUT_S, give_up=False)
+                except (BricktrackError, OSError) as e:
+                    self.lost_camera = str(e)
+                    logger.warning("camera: %s", e)
 
     def _in_time(self, what: str, call: Callable[[], T], timeout_s: float, *, give_up: bool = True) -> T:
         """Return what a camera's call returns; a call that hangs is left to its thread."""

@@ -88,7 +88,7 @@ def test_a_sensor_that_is_not_there_is_said_in_the_drivers_words() -> None:
 
 def test_a_set_up_that_never_ends_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(imu_reader, "SET_UP_TIMEOUT_S", 0.2)
-    reader = reader_on(FakeBusOpener(hang_after=0))
+    reader = reader_on(FakeBusOpener(hang_at_opening=True))
     reader.start()
     try:
         poll_until(reader, lambda: bool(reader.problem))

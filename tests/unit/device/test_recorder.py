@@ -364,6 +364,19 @@ def test_a_camera_that_does_not_stop_asks_for_a_new_start_once_nothing_is_under_
     assert b.store.list_runs()[0].state == "complete"
 
 
+def test_a_bug_in_stopping_the_camera_leaves_no_sampler_behind(bench: Callable[..., Bench]) -> None:
+    camera = FakeCamera()
+    b = bench(rig=FakeRig(camera=camera), imu=[ImuTable(name="brick", bus="a")])
+    b.arm()
+    session = b.recorder._session
+    assert session is not None
+    reader = session.imus[0]
+    camera.stop_error = RuntimeError("a bug")
+    reply = b.ask("disarm")
+    assert isinstance(reply, Refusal) and reply.code == "internal" and "a bug" in reply.message
+    assert not reader._process.is_alive() and reader._buffer is None
+
+
 def test_what_the_camera_itself_says_is_wrong_stands_in_the_run(
     bench: Callable[..., Bench], tmp_path: Path
 ) -> None:
