@@ -30,6 +30,7 @@ from bricktrack_host.fusion.pose_by_pose.moving_camera import (
     CameraImu,
     CameraMotion,
     align_both,
+    without_gains,
 )
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, smooth_poses
 from bricktrack_host.fusion.smoothing.smoother import BA, BG, GRAV, LAG, LOSS, SKEW, TAU, Estimate
@@ -266,11 +267,24 @@ def _run(
     )  # fmt: skip
 
 
-def _with_better_clocks(item: FusionInput, s: Smoothed, settings: FusionSettings) -> Run:
-    """Return the run of a moving camera anew: its poses in still axes are only as good as the clocks."""
+def _with_better_clocks(item: FusionInput, run: Run, s: Smoothed, settings: FusionSettings) -> Run:
+    """Return the run of a moving camera anew: its poses in still axes are only as good as the clocks.
+
+    The delay between both sensors is found with their errors taken out. These are then found again, from the
+    samples as they came: what is believed of them before counts once.
+    """
+    if run.camera is None or s.run.camera is None:
+        return run
     x = s.estimate.state.x[0, s.b]
-    alignment = replace(s.run.alignment, offset_ns=float(x[TAU] * 1e9), skew=float(x[SKEW]))
-    return _run(item, s.run.imu, alignment, s.run.camera, s.run.lever_arm_m * 1e3, settings, is_near=True)
+    alignment = replace(run.alignment, offset_ns=float(x[TAU] * 1e9), skew=float(x[SKEW]))
+    settled = settle_delay(
+        item.optical, without_gains(run.imu, gyro_gain=s.run.gyro_gain, acc_gain=s.run.acc_gain), alignment,
+        s.run.camera, lever_arm_mm=s.run.lever_arm_m * 1e3, settings=settings, is_near=True,
+    )  # fmt: skip
+    return Run.from_tracks(
+        item.optical, run.imu, alignment, lever_arm_mm=run.lever_arm_m * 1e3, output_t_ns=item.output_t_ns,
+        camera=replace(run.camera, delay_s=settled.delay_s),
+    )  # fmt: skip
 
 
 def _fuse_together(
@@ -280,8 +294,8 @@ def _fuse_together(
     smoothed = smooth_poses(runs, settings)
     if any(run.camera is not None for run in runs):
         runs = [
-            s.run if s.run.camera is None else _with_better_clocks(item, s, settings)
-            for item, s in zip(inputs, smoothed, strict=True)
+            _with_better_clocks(item, run, s, settings)
+            for item, run, s in zip(inputs, runs, smoothed, strict=True)
         ]
         smoothed = smooth_poses(runs, settings)
     return [

@@ -55,7 +55,7 @@ class Run:
         bias.
     gyro_gain, acc_gain : ndarray, shape (3, 3)
         Of the samples over the truth, as far as is known.
-    sensor_covariance : ndarray, shape (21, 21)
+    sensor_covariance : ndarray, shape (21, 21) or (42, 42)
         Of what is left in them and in the lever arm, see `sensor_errors.SensorErrors`.
     """
 
@@ -135,17 +135,30 @@ class Run:
         """Return the run with the errors of the sensor, and of its place, taken out."""
         gyro_gain = (np.eye(3) + errors.gyro) @ self.gyro_gain
         acc_gain = (np.eye(3) + errors.acc) @ self.acc_gain
+        camera, R_seen, p_seen_m = self.camera, self.R_seen, self.p_seen_m
+        if self.camera is not None:
+            camera = self.camera.with_acc_loss(0.0)
+            if errors.camera is not None:
+                camera = self.camera.with_sensor(errors.camera)
+                R_seen, p_seen_m = camera.poses_from(self.camera, self.aligned_s(), R_seen, p_seen_m)
         return replace(
             self,
             signal=ImuSignal.from_samples(
                 self.samples.without_gains(gyro_gain, acc_gain), gyro_filter_s=self.alignment.gyro_filter_s
             ),
-            camera=None if self.camera is None else self.camera.with_acc_loss(0.0),
+            camera=camera,
+            R_seen=R_seen,
+            p_seen_m=p_seen_m,
             lever_arm_m=self.lever_arm_m + errors.arm_m,
             gyro_gain=gyro_gain,
             acc_gain=acc_gain,
             sensor_covariance=errors.covariance,
         )
+
+    def aligned_s(self) -> FloatArray:
+        """Return IMU time of the frames as the alignment had it, shape (n,)."""
+        a = self.alignment
+        return np.asarray(self.t_cam_s + a.offset_ns * 1e-9 + a.skew * (self.t_cam_s - self.t_mid_s))
 
     def imu_time_s(self, t_cam_s: FloatArray, lin: Linearisation) -> FloatArray:
         """Return IMU time of camera time at the linearisation point."""
@@ -159,6 +172,10 @@ class Nodes:
     t_s: FloatArray
     node_of_frame: IntArray
 
+    def camera_attitudes(self, run: Run) -> FloatArray | None:
+        """Return how a camera that moves is turned at them, in still axes, shape (K, 3, 3)."""
+        return None if run.camera is None else run.camera.still_attitude(self.t_s)
+
 
 def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
     """Return start values from the alignment, the optical attitudes and the accelerometer.
@@ -168,7 +185,7 @@ def first_linearisation(run: Run, settings: FusionSettings) -> Linearisation:
     """
     a = run.alignment
     tau, lag = a.offset_ns * 1e-9, settings.acc_lag_ns * 1e-9
-    t_imu = run.t_cam_s + tau + a.skew * (run.t_cam_s - run.t_mid_s)
+    t_imu = run.aligned_s()
     whole = ~run.signal.in_gap(t_imu)
     whole = whole if whole.any() else np.ones(len(t_imu), dtype=bool)
     force = np.einsum("nij,nj->ni", run.R_seen[whole], run.signal.acc_at(t_imu[whole] + lag))

@@ -21,6 +21,7 @@ from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, align_ti
 from bricktrack_host.fusion.inertial.attitude import Attitude, mean_rate
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.fusion.smoothing.camera_errors import CameraErrors
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
 _ALIGN_ROUNDS = 3
@@ -91,6 +92,29 @@ class CameraMotion:
         signal = ImuSignal.from_track(self.imu, gyro_filter_s=self.gyro_filter_s, acc_filter_s=filter_s)
         return replace(self, signal=signal)
 
+    def with_sensor(self, errors: CameraErrors) -> "CameraMotion":
+        """Return the motion with the errors of the sensor, and of its place, taken out."""
+        eye = np.eye(3)
+        imu = without_gains(self.imu, gyro_gain=eye + errors.gyro, acc_gain=eye + errors.acc)
+        signal = ImuSignal.from_track(imu, gyro_filter_s=self.gyro_filter_s)
+        bias = closing_bias(signal, mean_rate(imu))
+        return replace(
+            self,
+            imu=imu,
+            signal=signal,
+            bias_radps=bias,
+            attitude=Attitude(signal, bias),
+            imu_to_camera_m=self.imu_to_camera_m + errors.arm_m,
+        )
+
+    def poses_from(
+        self, other: "CameraMotion", t_s: FloatArray, R: FloatArray, p_m: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return poses in still axes by this motion, shape (n, 3, 3) and (n, 3), that were so by another."""
+        between = self.still_attitude(t_s) @ np.swapaxes(other.still_attitude(t_s), 1, 2)
+        arm_m = self.still_attitude(t_s) @ (self.imu_to_camera_m - other.imu_to_camera_m)
+        return between @ R, np.asarray(np.einsum("nij,nj->ni", between, p_m) + arm_m)
+
     def own_s(self, t_s: FloatArray) -> FloatArray:
         """Return instants of the brick's IMU as seconds of the camera's."""
         shift = (self.epoch_ns - self.signal.epoch_ns) * 1e-9 + self.delay_s
@@ -149,6 +173,15 @@ class CameraMotion:
             covariance=turn @ track.covariance @ np.swapaxes(turn, 1, 2),
             flags=track.flags,
         )
+
+
+def without_gains(imu: ImuTrack, *, gyro_gain: FloatArray, acc_gain: FloatArray) -> ImuTrack:
+    """Return samples without the gains, shape (3, 3), that they have over the truth."""
+    return replace(
+        imu,
+        gyro_radps=imu.gyro_radps @ np.linalg.inv(gyro_gain).T,
+        acc_mps2=imu.acc_mps2 @ np.linalg.inv(acc_gain).T,
+    )
 
 
 def still_track(optical: OpticalTrack, motion: CameraMotion, t_s: FloatArray) -> OpticalTrack:

@@ -160,7 +160,9 @@ def _with_known_sensors(
     passed = Filter(problem)
     known = []
     for b, run in enumerate(runs):
-        errors = estimate_sensor_errors(problem, passed, b, settings)
+        errors = estimate_sensor_errors(
+            problem, passed, b, settings, R_still_camera=nodes[b].camera_attitudes(run)
+        )
         known.append(run if errors is None else run.with_sensor(errors))
     return known, lins
 

@@ -106,7 +106,10 @@ def smooth_poses(runs: list[Run], settings: FusionSettings) -> list[Smoothed]:
         if is_last or all(np.array_equal(u, j) for u, j in zip(used, judged, strict=True)):
             break
         used = judged
-    estimate = with_sensor_doubt(problem, passed, estimate, [run.sensor_covariance for run in runs])
+    estimate = with_sensor_doubt(
+        problem, passed, estimate, [run.sensor_covariance for run in runs],
+        R_still_camera=[node.camera_attitudes(run) for node, run in zip(nodes, runs, strict=True)],
+    )  # fmt: skip
     return [
         Smoothed(run, node, lin, problem, passed, estimate, b, used[b], scales[b], levels[b], chi2[b])
         for b, (run, node, lin) in enumerate(zip(runs, nodes, lins, strict=True))

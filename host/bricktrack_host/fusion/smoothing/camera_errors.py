@@ -1,9 +1,9 @@
 """Errors of the sensor at a moving camera that stand still, and how the relative motion depends on them.
 
-They are those of any inertial sensor (`sensor_errors`): scale, crossed axes and place. Its gyro makes the axes
-that stand still (`pose_by_pose.moving_camera`), so an error of its gain turns these by what that error makes of
-the camera's rocking, and with them all poses seen and the force felt. Its accelerometer's errors act on the
-velocity. Its place acts on the poses alone.
+They are those of any inertial sensor (`sensor_errors`): scale, crossed axes and place. Its gyro makes the
+axes that stand still (`pose_by_pose.moving_camera`), so an error of its gain turns these by what that error
+makes of the camera's rocking, and with them all poses seen and the force felt. Its accelerometer's errors act
+on the velocity. Its place acts on the poses alone.
 """
 
 from dataclasses import dataclass

@@ -75,9 +75,7 @@ class _Way:
     dy: FloatArray
 
 
-def _way(
-    problem: Problem, passed: Filter, b: int, *, of: IntArray, camera: CameraWay | None = None
-) -> _Way:
+def _way(problem: Problem, passed: Filter, b: int, *, of: IntArray, camera: CameraWay | None = None) -> _Way:
     at = np.flatnonzero(problem.has_frame[:, b])
     before = passed.predicted(at, b, of=of)
     R, x = before.R[at], before.x
