@@ -258,7 +258,7 @@ def _write_files(result: RunResult, folder: Path) -> None:
     if result.edge_fit is not None:
         tables["edges"] = edges_table(result.edge_fit, t0_ns=t0_ns, metadata=metadata)
     for name, table in tables.items():
-        pa.parquet.write_table(table, folder / f"{name}.parquet", compression="zstd")
+        _pack(table, folder / f"{name}.parquet")
         flat = table.drop_columns(["covariance"]) if "covariance" in table.column_names else table
         pa.csv.write_csv(flat, folder / f"{name}.csv", pa.csv.WriteOptions(quoting_style="needed"))
     summary = _Summary(
@@ -279,6 +279,13 @@ def _write_files(result: RunResult, folder: Path) -> None:
     )
     (folder / SUMMARY_NAME).write_bytes(dump_json(summary))
     (folder / TIMINGS_NAME).write_bytes(dump_json(result.timings_s))
+
+
+def _pack(table: "pa.Table", path: Path) -> None:
+    """Write a Parquet table; what is measured hardly repeats, and dictionaries of it take time and room."""
+    types = pa.types
+    repeats = [c.name for c in table.schema if types.is_string(c.type) or types.is_integer(c.type)]
+    pa.parquet.write_table(table, path, compression="zstd", use_dictionary=repeats)  # type: ignore[arg-type]
 
 
 def read_provenance(folder: Path) -> Provenance:

@@ -61,6 +61,14 @@ def test_processing_again_gives_the_same_bytes_whatever_the_time_it_took(result,
     assert json.loads((tmp_path / "results" / "timings.json").read_text()) == {"decode": 1234.5}
 
 
+def test_only_what_repeats_is_packed_with_a_dictionary(folder):
+    group = pq.read_metadata(folder / "fused.parquet").row_group(0)
+    columns = (group.column(i) for i in range(group.num_columns))
+    dictionaries = {c.path_in_schema for c in columns if "RLE_DICTIONARY" in c.encodings}
+    assert {"kind", "flag_words"} <= dictionaries
+    assert not [name for name in dictionaries if name.endswith(("_mm", "_rad", "_deg", "_mmps", "element"))]
+
+
 def test_everything_comes_back(result, folder):
     back = read_result(folder)
     for track, other in [
