@@ -73,7 +73,8 @@ def retime(
     """Solve the poses again with each LED carried to its frame's instant by the fused motion.
 
     Splines through 30 frames a second cannot follow a motion above 15 Hz, and read-out takes 20 ms: the IMU
-    knows what the brick did meanwhile. Where its samples are missing, it does not, and the splines stay.
+    knows what the brick did meanwhile. Where its samples are missing, it does not, and the splines stay; so
+    they do where the fused motion is not known.
     """
     if inertial is None or inertial.is_hint or brick.imu_lever_arm_mm is None:
         return optical
@@ -88,7 +89,8 @@ def retime(
         except (ShapeError, TrackingError):
             return optical  # the fusion itself will say why
         motion = led_motion(rows_of(track, slice(0, n)), rows_of(track, slice(n, None)), n_instants=2)
-        motion = _with_splines(motion, optical, _frames_unfelt(optical, inertial))
+        unknown = ~np.isfinite(motion.shift_camera_mm).all(axis=(1, 2))
+        motion = _with_splines(motion, optical, unknown | _frames_unfelt(optical, inertial))
         optical = solve_poses(observations, rays, brick, motion=motion, first=first)
         if not np.isfinite(optical.t_camera_brick_mm).any():
             break

@@ -8,7 +8,7 @@ from daemon_runs import simulate_run
 
 from bricktrack_host.fusion.estimate import FusionInput, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion
+from bricktrack_host.fusion.pose_by_pose.fused_output import common_part, sample_motion
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracking.optical_track import solve_poses
@@ -59,3 +59,15 @@ def test_a_pose_whose_covariance_is_none_is_no_pose(smoothed, wrong):
         assert np.array_equal(lost, np.isnan(values.reshape(len(lost), -1)).all(axis=1))
     diagonal = np.diagonal(track.covariance[~lost], axis1=1, axis2=2)
     assert (diagonal > 0).all()
+
+
+def test_what_frames_share_is_a_covariance_however_they_differ():
+    # Frames of three kinds: the medians of their elements are no covariance.
+    together = np.repeat([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, -1.0]], 20, axis=0)
+    sd = np.repeat([1e-3, 1e-2], 3)
+    covariances = np.tile(np.eye(6), (60, 1, 1))
+    covariances[:, :3, :3] = 0.1 * np.eye(3) + 0.9 * together[:, :, None] * together[:, None, :]
+    covariances *= np.outer(sd, sd)
+    assert np.linalg.eigvalsh(np.median(covariances, axis=0) / np.outer(sd, sd))[0] < -0.5
+    common = common_part(covariances, np.array([0.5, 0.5]), share=0.3)
+    assert np.linalg.eigvalsh(common / np.outer(sd, sd))[0] > 0

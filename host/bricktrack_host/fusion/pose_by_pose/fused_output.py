@@ -209,7 +209,10 @@ def common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> FloatA
         Of the stated sd that is in common in any case.
     """
     share_at = np.repeat(np.sqrt(np.maximum((share * scale) ** 2, 1.0 - scale**2)), 3)
-    return np.asarray(share_at[:, None] * np.median(cov_seen, axis=0) * share_at)
+    # A frame's own matrix: medians of single elements would be no covariance.
+    size = np.log(np.diagonal(cov_seen, axis1=1, axis2=2)).sum(axis=1)
+    median = cov_seen[np.argsort(size)[len(size) // 2]]
+    return np.asarray(share_at[:, None] * median * share_at)
 
 
 def unsure_times(
