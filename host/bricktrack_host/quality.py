@@ -63,6 +63,9 @@ class PoseFlag(IntFlag):
     CONTESTED = 16384
     """Fused: a frame and all the rest contradict each other here, and either may be right. The pose
     is the mean of both, and the covariance reaches both."""
+    RESTAMPED = 32768
+    """The stamp of this frame was whole periods of the camera off and was mended; without a pose, the frame
+    is a copy of another, or moves where it is not known from which frame on the stamps slip."""
 
 
 def describe(flags: int) -> str:

@@ -1,6 +1,6 @@
 """The stage of the clocks: square wave, choice of the inertial samples, their alignment, the pose at rest."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from bricktrack_common.errors import ConfigError, ShapeError, TrackingError
 from bricktrack_common.imu_records import STANDARD_GRAVITY_MPS2, ImuDescription, ImuSamples
 from bricktrack_common.run_folder import Run
 from bricktrack_host.fusion.clocks.frame_stamps import check_stamps
+from bricktrack_host.fusion.clocks.slip_search import find_slips
+from bricktrack_host.fusion.clocks.stamp_slips import StampSlips
 from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, align_times
 from bricktrack_host.fusion.pose_by_pose.moving_camera import (
     NOT_OBSERVABLE,
@@ -17,11 +19,12 @@ from bricktrack_host.fusion.pose_by_pose.moving_camera import (
     CameraImu,
     align_both,
 )
+from bricktrack_host.quality import LedFlag
 from bricktrack_host.results.daq_clock import EdgeFit, EdgeFitError, fit_edges
 from bricktrack_host.results.rest_pose import RestPose, tare
 from bricktrack_host.stages.camera_sensor import read_camera_sensor
 from bricktrack_host.stages.settings import ProcessSettings
-from bricktrack_host.tracks import ImuTrack, OpticalTrack
+from bricktrack_host.tracks import ImuTrack, LedObservations, OpticalTrack
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +60,8 @@ class Inertial:
     is_hint : bool
         Whether the camera moves and nothing feels it: the samples cannot be fused, and only hint at turns and
         impacts.
+    slips : StampSlips or None
+        Where the frames' stamps slip by whole periods; the alignment is of the mended ones.
     """
 
     imu: ImuTrack
@@ -65,6 +70,7 @@ class Inertial:
     camera_alignment: CameraAlignment | None = None
     chip: ChipOrientation | None = None
     is_hint: bool = False
+    slips: StampSlips | None = None
 
 
 def fit_square_wave(run: Run, problems: list[str]) -> EdgeFit | None:
@@ -141,6 +147,10 @@ def align(
     within_s = settings.max_clock_offset_s
     prior_sd_ns = 5e6 if run.manifest.origin == "bricktrackd" else within_s * 1e9
     camera, chip = None, chip_orientation(run, brick, settings)
+
+    def aligned(poses: OpticalTrack) -> TimeAlignment:
+        return align_times(poses, imu, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
+
     if settings.camera != "static":
         sensor = settings.camera_sensor
         camera = None if sensor is None else read_camera_sensor(run, sensor, edge_fit, problems)
@@ -156,9 +166,17 @@ def align(
         if camera is not None:
             both = align_both(optical, imu, camera, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
             inertial = Inertial(imu, both.brick, camera, both, chip=chip)
+        elif settings.camera != "static":
+            inertial = Inertial(imu, aligned(optical), chip=chip, is_hint=True)
         else:
-            alignment = align_times(optical, imu, max_offset_s=within_s, prior_sd_ns=prior_sd_ns)
-            inertial = Inertial(imu, alignment, chip=chip, is_hint=settings.camera != "static")
+            alignment = aligned(optical)
+            slips = find_slips(
+                optical, imu, alignment, aligned, prior_sd_ns=prior_sd_ns, max_offset_s=within_s
+            )
+            if slips is not None:
+                alignment = slips.alignment
+                problems.extend(slips.words())
+            inertial = Inertial(imu, alignment, chip=chip, slips=slips)
     except ShapeError as e:
         problems.append(f"the inertial samples cannot be used: {e}")
         return None
@@ -170,6 +188,21 @@ def align(
             f"{inertial.camera_alignment.camera.reason}"
         )
     return inertial
+
+
+def with_stamps_mended(observations: LedObservations, slips: StampSlips, t_ns: IntArray) -> LedObservations:
+    """Return observations with slipped stamps mended, and no LEDs where a frame has no instant of its own.
+
+    ``t_ns``, shape (n_frames,): the frames' instants by their stamps as they were.
+    """
+    out = slips.left_out[:, None]
+    return replace(
+        observations,
+        sensor_timestamp_ns=observations.sensor_timestamp_ns + (slips.t_ns - t_ns),
+        uv_px=np.where(out[..., None], np.nan, observations.uv_px),
+        led_flags=observations.led_flags | np.where(out, int(LedFlag.MISSING), 0),
+        frame_flags=observations.frame_flags | slips.frame_flags,
+    )
 
 
 def unsure_stamps(
@@ -185,7 +218,8 @@ def unsure_stamps(
     else:
         check = check_stamps(stamps_ns, optical, inertial.imu, inertial.alignment)
     problems.extend(check.problems)
-    return np.asarray(check.sd_ns, dtype=np.float64)
+    slips_ns = 0.0 if inertial is None or inertial.slips is None else inertial.slips.sd_ns
+    return np.hypot(check.sd_ns, slips_ns)
 
 
 def rest_pose(optical: OpticalTrack, inertial: Inertial | None, problems: list[str]) -> RestPose | None:

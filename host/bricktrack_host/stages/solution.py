@@ -18,7 +18,14 @@ from bricktrack_host.reporting.fusion_check import TwoFusions
 from bricktrack_host.results.ray_errors import ray_errors
 from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.results.result_store import Provenance, RunResult, software_version
-from bricktrack_host.stages.clocks import align, choose_imu, fit_square_wave, rest_pose, unsure_stamps
+from bricktrack_host.stages.clocks import (
+    align,
+    choose_imu,
+    fit_square_wave,
+    rest_pose,
+    unsure_stamps,
+    with_stamps_mended,
+)
 from bricktrack_host.stages.details import alignment_details, calibration_details
 from bricktrack_host.stages.motion import fuse_run, output_grid, retime, with_ray_errors, with_unsure_times
 from bricktrack_host.stages.progress import Stages
@@ -85,6 +92,12 @@ def solve_run(
         edge_fit = fit_square_wave(run, problems)
         imu = choose_imu(run, brick, settings, problems)
         inertial = None if imu is None else align(optical, imu, run, brick, edge_fit, settings, problems)
+        if inertial is not None and inertial.slips is not None:
+            observations = with_stamps_mended(observations, inertial.slips, optical.t_ns)
+            first = start_poses(observations, rays, brick, form=settings.prsoi_form)
+            optical = solve_poses(
+                observations, rays, brick, rolling_shutter=settings.rolling_shutter, first=first
+            )
         time_sd_ns = unsure_stamps(observations.sensor_timestamp_ns, optical, inertial, problems)
         rest = rest_pose(optical, inertial, problems)
     with stages("fuse"):

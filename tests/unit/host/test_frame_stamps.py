@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from brick_shakes import simulate_shake
 
+from bricktrack_common.arrays import rows_of
 from bricktrack_host.fusion.clocks.frame_stamps import check_stamps, offset_change
 from bricktrack_host.fusion.clocks.stamp_regularity import stamp_regularity
 from bricktrack_host.fusion.clocks.time_alignment import align_times
@@ -24,16 +25,13 @@ def shake():
     return simulate_shake(3, frame_rate_hz=32.0, duration_s=6.0, offset_s=0.01)
 
 
-def checked(shake, stamps_ns, frames=slice(None), *, is_taken_then=False):
+def checked(shake, stamps_ns, frames=None, *, is_taken_then=False):
     """Return what the stamps are found to be; the pictures taken when stamped, or evenly all the same."""
-    optical = shake.optical
-    R, t_mm = optical.R_camera_brick[frames], optical.t_camera_brick_mm[frames]
+    optical = rows_of(shake.optical, slice(len(stamps_ns)) if frames is None else frames)
+    optical = replace(optical, t_ns=stamps_ns)
     if is_taken_then:
         R, t_mm = shake.truth(stamps_ns)
-    n = len(stamps_ns)
-    optical = replace(
-        optical, t_ns=stamps_ns, R_camera_brick=R, t_camera_brick_mm=t_mm, covariance=optical.covariance[:n]
-    )
+        optical = replace(optical, R_camera_brick=R, t_camera_brick_mm=t_mm)
     return check_stamps(stamps_ns, optical, shake.imu, align_times(optical, shake.imu)), optical
 
 

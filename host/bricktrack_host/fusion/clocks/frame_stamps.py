@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
 from bricktrack_host.fusion.clocks.stamp_regularity import (
     JITTER_NS,
@@ -21,6 +21,7 @@ from bricktrack_host.fusion.clocks.stamp_regularity import (
 from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _WINDOW_S = 3.0  # of motion on either side of a step
@@ -139,8 +140,11 @@ def check_stamps(
     imu, alignment : ImuTrack and TimeAlignment, or None
         Without them the rate alone is looked at.
     """
+    # A copy of another frame has no instant of its own.
+    frame = np.flatnonzero(has_pose(optical) | ((optical.flags & int(PoseFlag.RESTAMPED)) == 0))
+    n_frames, stamps_ns, optical = len(stamps_ns), stamps_ns[frame], rows_of(optical, frame)
     regularity = stamp_regularity(stamps_ns)
-    problems = _words_on_rate(regularity)
+    problems = _words_on_rate(regularity, frame)
     sd_ns = np.hypot(regularity.stray_ns, regularity.jitter_ns if regularity.jitter_ns > JITTER_NS else 0.0)
     is_contradicted, level, levels_ns = False, 0.0, [0.0]
     ends = [0, *(s.frame for s in regularity.steps), len(stamps_ns)]
@@ -158,7 +162,7 @@ def check_stamps(
         if verdict != "paused":
             level += step.size_ns
             levels_ns.append(level)
-        problems.append(_step_words(step, regularity.period_ns, change, verdict))
+        problems.append(_step_words(step, frame, regularity.period_ns, change, verdict))
     spread_ns = max(levels_ns) - min(levels_ns)
     if not regularity.steps and imu is not None and alignment is not None:
         change = _change_of_halves(optical, imu, alignment)
@@ -180,11 +184,13 @@ def check_stamps(
                 "that both saw, where crystals hold 100: one of the two is scaled. Poses are as unsure as "
                 f"the motion in the {spread_ns / 1e6:.1f} ms that come together to either end of the run"
             )
-    return StampCheck(regularity, np.hypot(sd_ns, spread_ns), tuple(problems), is_contradicted)
+    of_all_ns = np.zeros(n_frames)
+    of_all_ns[frame] = np.hypot(sd_ns, spread_ns)
+    return StampCheck(regularity, of_all_ns, tuple(problems), is_contradicted)
 
 
-def _words_on_rate(regularity: StampRegularity) -> list[str]:
-    """Return what the stamps alone say against themselves, steps left out."""
+def _words_on_rate(regularity: StampRegularity, frame: IntArray) -> list[str]:
+    """Return what the stamps alone say against themselves, steps left out; ``frame`` are those looked at."""
     problems: list[str] = []
     period_ms = regularity.period_ns / 1e6
     if not regularity.is_steady and len(regularity.stray_ns) >= MIN_FRAMES:
@@ -204,8 +210,9 @@ def _words_on_rate(regularity: StampRegularity) -> list[str]:
         worst = int(strays[np.argmax(np.abs(regularity.stray_ns[strays]))])
         problems.append(
             f"{strays.size} frame stamp{'' if strays.size == 1 else 's'} off a steady period of "
-            f"{period_ms:.3f} ms, most that of frame {worst} by {regularity.stray_ns[worst] / 1e6:+.2f} ms: "
-            "poses there are as unsure as the motion in that time"
+            f"{period_ms:.3f} ms, most that of frame {frame[worst]} by "
+            f"{regularity.stray_ns[worst] / 1e6:+.2f} ms: poses there are as unsure as the motion in that "
+            "time"
         )
     return problems
 
@@ -223,14 +230,15 @@ def _verdict(step: StampStep, change: OffsetChange | None) -> Literal["stamps", 
 
 def _step_words(
     step: StampStep,
+    frame: IntArray,
     period_ns: float,
     change: OffsetChange | None,
     verdict: Literal["stamps", "paused", "unknown"],
 ) -> str:
     found = (
-        f"frame stamps step by {step.size_ns / 1e6:+.2f} ms between frames {step.frame - 1} and "
-        f"{step.frame}: {step.interval_ns / 1e6:.2f} ms is {step.interval_ns / period_ns:.2f} periods of a "
-        f"steady {period_ns / 1e6:.3f} ms"
+        f"frame stamps step by {step.size_ns / 1e6:+.2f} ms between frames {frame[step.frame - 1]} and "
+        f"{frame[step.frame]}: {step.interval_ns / 1e6:.2f} ms is {step.interval_ns / period_ns:.2f} periods "
+        f"of a steady {period_ns / 1e6:.3f} ms"
     )
     doubt = "Poses of the whole run are as unsure as the motion in that time"
     if change is None:

@@ -1,0 +1,185 @@
+"""Frame stamps that slip by whole periods from some frame on: what is said of them, and how they mend."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, has_pose
+from bricktrack_host.quality import PoseFlag
+from bricktrack_host.tracks import OpticalTrack
+
+_MOVES = 22.5  # chi-square with six degrees of freedom, once in a thousand
+_DOUBLE_PERIODS = 0.25  # less than this after the frame before: the same picture once more
+
+
+@dataclass(frozen=True, slots=True)
+class StampSlip:
+    """One place where the stamps slip.
+
+    Attributes
+    ----------
+    frame : int
+        The likeliest first frame behind it, from 0.
+    first, last : int
+        The first frame behind it lies from ``first`` to ``last``.
+    late_periods : int
+        By how many periods the stamps behind it are later than they were before it; negative: earlier.
+    """
+
+    frame: int
+    first: int
+    last: int
+    late_periods: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StampSlips:
+    """The slips of a run, and what mends them.
+
+    Attributes
+    ----------
+    slips : tuple of StampSlip
+        At least one.
+    period_ns : float
+    late_periods : ndarray of int64, shape (n_frames,)
+        By how many periods each stamp is late.
+    t_ns : ndarray of int64, shape (n_frames,), ns, rising
+        The frames' instants, mended.
+    left_out : ndarray of bool, shape (n_frames,)
+        Frames that have no instant of their own: copies of the frame before, and those that move where the
+        place of the slip is not known to the frame.
+    sd_ns : ndarray, shape (n_frames,)
+        How unsure the instant is: the slip itself where its place is not known, else zero.
+    is_side_told : bool
+        Whether the clocks told which stamps were right; else those before the first slip were kept.
+    alignment : TimeAlignment
+        With the stamps mended.
+    """
+
+    slips: tuple[StampSlip, ...]
+    period_ns: float
+    late_periods: IntArray
+    t_ns: IntArray
+    left_out: BoolArray
+    sd_ns: FloatArray
+    is_side_told: bool
+    alignment: TimeAlignment
+
+    @property
+    def is_mended(self) -> BoolArray:
+        """Whether each frame has another stamp now."""
+        return np.asarray((self.late_periods != 0) | self.left_out)
+
+    @property
+    def frame_flags(self) -> IntArray:
+        """What a pose of each frame has to be flagged with, `PoseFlag`."""
+        return np.where(self.is_mended, int(PoseFlag.RESTAMPED), 0)
+
+    def mended(self, optical: OpticalTrack) -> OpticalTrack:
+        """Return the poses at their own instants; NaN where a frame has none."""
+        out = self.left_out
+        shift_ns = self.t_ns - optical.t_ns
+        return replace(
+            optical,
+            t_ns=self.t_ns,
+            R_camera_brick=np.where(out[:, None, None], np.nan, optical.R_camera_brick),
+            t_camera_brick_mm=np.where(out[:, None], np.nan, optical.t_camera_brick_mm),
+            covariance=np.where(out[:, None, None], np.nan, optical.covariance),
+            flags=optical.flags | self.frame_flags | np.where(out, int(PoseFlag.NO_POSE), 0),
+            led_t_ns=optical.led_t_ns + shift_ns[:, None],
+        )
+
+    def words(self) -> list[str]:
+        """Return what happened and what was done, a line for each slip."""
+        lines = [self._slip_words(slip) for slip in self.slips]
+        right = (
+            "which stamps were right the clocks of camera and IMU tell"
+            if self.is_side_told
+            else "which stamps were right nothing tells: those before the first slip were kept"
+        )
+        n = int(np.count_nonzero(self.late_periods))
+        stamps = "1 frame stamp" if n == 1 else f"{n} frame stamps"
+        return [*lines, f"{stamps} mended by whole periods before anything was fused; {right}"]
+
+    def _slip_words(self, slip: StampSlip) -> str:
+        n, by_ms = abs(slip.late_periods), abs(slip.late_periods) * self.period_ns / 1e6
+        periods = f"{n} period{'' if n == 1 else 's'} ({by_ms:.2f} ms)"
+        side = "late" if slip.late_periods > 0 else "early"
+        pictures = "picture" if n == 1 else "pictures"
+        cause = (
+            f"{n} {pictures} there twice, or skipped in the stamps alone"
+            if slip.late_periods > 0
+            else f"{n} {pictures} lost and not counted"
+        )
+        near = slice(max(slip.first - 1, 0), slip.last + 1)
+        gone = int(np.count_nonzero(self.left_out[near]))
+        left_out = f"; {gone} frame{'' if gone == 1 else 's'} there left out" if gone else ""
+        if slip.first == slip.last:
+            place = f"from frame {slip.frame} on"
+        else:
+            place = f"from a frame between {slip.first} and {slip.last} on"
+        return (
+            f"frame stamps slip: {place} they come {periods} too {side}, by the turns that camera and gyro "
+            f"saw: {cause}{left_out}"
+        )
+
+
+def mend(
+    optical: OpticalTrack,
+    slips: list[StampSlip],
+    late_periods: IntArray,
+    *,
+    period_ns: float,
+    is_side_told: bool,
+    alignment: TimeAlignment,
+) -> StampSlips:
+    """Return what mends slips that were found.
+
+    Parameters
+    ----------
+    optical : OpticalTrack
+        With instants as stamped.
+    slips, late_periods, period_ns, is_side_told, alignment
+        See `StampSlips`.
+    """
+    in_doubt = np.zeros(len(optical.t_ns), dtype=np.int64)  # by so many periods
+    for slip in slips:
+        in_doubt[slip.first : slip.last] = abs(slip.late_periods)
+    t_ns = optical.t_ns - np.rint(late_periods * period_ns).astype(np.int64)
+    t_ns, is_copy = _without_copies(t_ns, period_ns)
+    left_out = is_copy | ((in_doubt > 0) & _may_move(optical, in_doubt))
+    sd_ns = np.where(left_out, 0.0, in_doubt * period_ns)
+    return StampSlips(tuple(slips), period_ns, late_periods, t_ns, left_out, sd_ns, is_side_told, alignment)
+
+
+def _may_move(optical: OpticalTrack, periods: IntArray) -> BoolArray:
+    """Return which frames have no pose, or move within so many frames by more than poses scatter."""
+    n = len(optical.t_ns)
+    out = ~has_pose(optical)
+    for i in np.flatnonzero((periods > 0) & ~out):
+        beside = [k for d in range(1, int(periods[i]) + 1) for k in (i - d, i + d) if 0 <= k < n]
+        for k in (k for k in beside if not out[k]):
+            turn = rvec_from_matrix(optical.R_camera_brick[k].T @ optical.R_camera_brick[i])
+            off = np.append(turn, optical.t_camera_brick_mm[i] - optical.t_camera_brick_mm[k])
+            both = optical.covariance[i] + optical.covariance[k]
+            out[i] |= bool(off @ np.linalg.solve(both, off) > _MOVES)
+    return np.asarray(out)
+
+
+def _without_copies(t_ns: IntArray, period_ns: float) -> tuple[IntArray, BoolArray]:
+    """Return rising instants, and which frames are copies of those before, put evenly up to the next."""
+    t_ns, latest = t_ns.copy(), np.maximum.accumulate(t_ns)
+    is_copy = np.zeros(len(t_ns), dtype=np.bool_)
+    is_copy[1:] = t_ns[1:] < latest[:-1] + round(_DOUBLE_PERIODS * period_ns)
+    kept = np.flatnonzero(~is_copy)
+    frames = np.flatnonzero(is_copy)
+    beyond = t_ns[kept[-1]] + round(period_ns)
+    t_ns[frames] = (
+        np.rint(
+            np.interp(frames, np.append(kept, len(t_ns)), np.append(t_ns[kept] - t_ns[0], beyond - t_ns[0]))
+        ).astype(np.int64)
+        + t_ns[0]
+    )
+    return t_ns, is_copy
