@@ -8,7 +8,7 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.reporting.chart import Chart, panel_grid
 from bricktrack_host.reporting.chart_marks import band
-from bricktrack_host.reporting.plots import FUSED, INK, TimeAxis, line, mark_events
+from bricktrack_host.reporting.plots import FUSED, LED_COLOURS, TimeAxis, line, mark_events
 from bricktrack_host.reporting.thinning import thinned_band
 from bricktrack_host.results.result_store import Details, RunResult
 from bricktrack_host.results.run_summary import KeyFigures
@@ -16,8 +16,6 @@ from bricktrack_host.tracks import FusedTrack
 
 CHECK_PREFIX = "pose_level_"
 """Names of the figures of the check begin so, among what the results say of the fusion."""
-
-_COLOURS = (FUSED, INK, "#b0632a")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +53,7 @@ def fusion_check_chart(result: RunResult, figures: KeyFigures, two: TwoFusions) 
         mark_events(panel, axis, result, figures)
         t_s, half = axis.s(t_ns), 1.96 * allowed.max(axis=1)
         panel.add(band(*thinned_band(t_s, -half, half), colour=FUSED, opacity=0.15, label="allowed, 95 %"))
-        for i, colour in enumerate(_COLOURS):
+        for i, colour in enumerate(LED_COLOURS[:3]):
             panel.add(line(t_s, values[:, i], colour=colour, width_pt=0.8, label="xyz"[i]))
         limit = _limit(values)
         panel.y_limits, panel.y_label = (-limit, limit), words

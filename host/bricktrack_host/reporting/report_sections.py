@@ -1,5 +1,6 @@
 """The sections of a run's report: words, tables and embedded figures, ready for the template."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -173,7 +174,7 @@ def _residual_section(result: RunResult) -> Section:
         mean = used.mean(axis=0) if len(used) else np.full(2, np.nan)
         rms = np.sqrt(np.mean(used**2, axis=0)) if len(used) else np.full(2, np.nan)
         largest = np.linalg.norm(used, axis=1).max() if len(used) else np.nan
-        cells = [str(len(used)), *(f"{x:.3f}" for x in (*mean, *rms, largest))]
+        cells = [str(len(used)), *(f"{x:z.3f}" for x in (*mean, *rms, largest))]
         rows.append([name, *cells])
     head = ["LED", "frames used", "mean u, px", "mean v, px", "rms u, px", "rms v, px", "largest, px"]
     section.tables.append(SectionTable("", head, rows, 1))
@@ -252,7 +253,7 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
         "the brick's axes. Honest covariances give a NEES/6 of 1, and 95 % of poses in their 95 % region."
     ])  # fmt: skip
     units = ["mm", "mm", "mm", "deg", "deg", "deg"]
-    head = ["track", "instants", "n", "without"]
+    head = ["track", "instants", "n", "no pose"]
     names = [f"{c}, {u}" for c, u in zip(COMPONENTS, units, strict=True)]
 
     def cells(g: GroupErrors) -> list[str]:
@@ -283,18 +284,32 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
 _UNITS = dict.fromkeys(("ms", "us", "ns", "s", "ppm", "um", "mm", "px", "deg")) | {
     "hz": "Hz", "mps2": "m/s²", "radps": "rad/s", "dps": "deg/s",
 }  # fmt: skip
+_IN_FULL = {
+    "acc_lag": "accelerometer behind gyroscope",
+    "acc_bias": "accelerometer's bias",
+    "gyro_bias": "gyroscope's bias",
+    "gravity_camera": "gravity in camera axes",
+    "mean_nis": "innovation squared over its variance, mean (2 for LEDs, 6 for poses)",
+    "offset": "IMU time less camera time",
+    "offset_sd": "... standard deviation",
+    "skew": "rate of IMU time against camera time",
+    "skew_sd": "... standard deviation",
+    "smoothed_offset": "IMU time less camera time, by the fusion",
+    "smoothed_offset_sd": "... standard deviation",
+    "smoothed_skew": "rate of IMU time against camera time, by the fusion",
+}
 
 
 def in_words(name: str) -> str:
-    """Return a key as words, its unit behind a comma: ``acc_bias_mps2`` as ``acc bias, m/s²``."""
+    """Return a key as words, its unit behind a comma: ``table_bias_mps2`` as ``table bias, m/s²``."""
     words, _, unit = name.rpartition("_")
-    if words and unit in _UNITS:
-        return f"{words.replace('_', ' ')}, {_UNITS[unit] or unit}"
-    return name.replace("_", " ")
+    if not words or unit not in _UNITS:
+        return _IN_FULL.get(name, name.replace("_", " "))
+    return f"{_IN_FULL.get(words, words.replace('_', ' '))}, {_UNITS[unit] or unit}"
 
 
 def value_text(value: DetailValue) -> str:
-    """Return a value as people read it."""
+    """Return a value as people read it; a vector's parts to the same place, the largest with four digits."""
     if value is None or value == "":
         return "–"
     if isinstance(value, bool):
@@ -302,5 +317,10 @@ def value_text(value: DetailValue) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list):
+        numbers = [v for v in value if isinstance(v, float) and math.isfinite(v)]
+        if value and len(numbers) == len(value):
+            largest = max(abs(v) for v in numbers)
+            decimals = max(0, 3 - math.floor(math.log10(largest))) if largest else 0
+            return ", ".join(f"{v:z.{decimals}f}" for v in numbers)
         return ", ".join(value_text(v) for v in value)
     return str(value)
