@@ -297,7 +297,7 @@ def _fuse_together(
             _with_better_clocks(item, run, s, settings)
             for item, run, s in zip(inputs, runs, smoothed, strict=True)
         ]
-        smoothed = smooth_poses(runs, settings)
+        smoothed = smooth_poses(runs, settings, levels=[s.levels for s in smoothed])
     return [
         fused_result(item, s, settings, with_forward=with_forward)
         for item, s in zip(inputs, smoothed, strict=True)

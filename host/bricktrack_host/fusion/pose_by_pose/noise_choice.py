@@ -109,14 +109,18 @@ def settle_noise(
     nodes: list[Nodes],
     used: list[BoolArray],
     settings: FusionSettings,
+    *,
+    levels: list[tuple[NoiseLevel, NoiseLevel]] | None = None,
 ) -> Settled:
     """Return a first pass with the noise of frames and samples, and the sensors' lags, as the run tells them.
 
     Optical noise understated by much lets the smoother follow the frames and hides itself, so the scale is
     taken again until it stands; when it does at once, as it should, this is one pass.
+
+    ``levels``: of gyro and accelerometer, by which their standing errors are sought; if not given, as stated.
     """
     stated = NoiseLevel(settings.roughness_share, 1.0)
-    levels = [(stated, stated) for _ in runs]
+    levels = levels or [(stated, stated) for _ in runs]
     scales = [np.ones(2) for _ in runs]
     runs, lins = _with_known_sensors(runs, lins, nodes, used, levels, settings)
     for _ in range(_MAX_SCALE_ROUNDS):

@@ -79,14 +79,23 @@ class Smoothed:
     chi2: FloatArray
 
 
-def smooth_poses(runs: list[Run], settings: FusionSettings) -> list[Smoothed]:
-    """Return the smoothed states of a batch of runs."""
+def smooth_poses(
+    runs: list[Run],
+    settings: FusionSettings,
+    *,
+    levels: list[tuple[NoiseLevel, NoiseLevel]] | None = None,
+) -> list[Smoothed]:
+    """Return the smoothed states of a batch of runs.
+
+    ``levels``: of gyro and accelerometer, where they are known from before: the sensors' standing errors are
+    found the better for it.
+    """
     lins = [first_linearisation(run, settings) for run in runs]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
     starts = [_agreeing_start(*three) for three in zip(runs, nodes, lins, strict=True)]
     lins = [lin for lin, _ in starts]
     used = [agrees for _, agrees in starts]
-    first = settle_noise(runs, lins, nodes, used, settings)
+    first = settle_noise(runs, lins, nodes, used, settings, levels=levels)
     scales, levels = first.scales, first.levels
     for b, far in enumerate(first.chi2):
         good = far < settings.gate_chi2
