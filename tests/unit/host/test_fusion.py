@@ -149,7 +149,10 @@ def test_gaps_outside_and_extrapolation_are_flagged_and_unsure():
     e = errors(s, pick(track, given))  # the truth reaches 0.6 s beyond the run
     within = np.abs(e[:, 3:]) < 5 * np.sqrt(np.diagonal(track.covariance[given], axis1=1, axis2=2)[:, 3:])
     assert within.mean() > 0.995
-    assert sd_mm[np.abs(t - 2.56).argmin()] > 2 * sd_mm[np.abs(t - 2.3).argmin()]
+    # The camera saw the brick in the gap: there it is as unsure as its frames, beside it they are averaged.
+    in_gap_mm = sd_mm[np.abs(t - 2.56).argmin()]
+    assert in_gap_mm > 1.2 * sd_mm[np.abs(t - 2.3).argmin()]
+    assert 0.08 < in_gap_mm < 0.2
 
 
 def pick(track, where):

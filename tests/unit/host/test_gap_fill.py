@@ -67,7 +67,10 @@ def test_in_a_gap_the_fused_motion_is_no_worse_than_the_frames_and_honest(seed):
     off_mm = s.optical.t_camera_brick_mm[seen] - true_mm
     assert rms_mm(e[:n]) < 1.1 * np.sqrt((off_mm**2).sum(axis=1).mean())
     chi2 = (e * np.linalg.solve(track.covariance, e[..., None])[..., 0]).sum(axis=1)
-    assert chi2[:n].mean() < 9.0 and chi2[n:].mean() < 12.0
+    # 6 when honest; a gap holds five frames, whose mean scatters by 6 / sqrt(3 * 5) and more.
+    assert 2.5 < chi2[:n].mean() < 9.5 and 2.5 < chi2[n:].mean() < 9.5
+    # A gap is no impact: what stands on either side of it are no neighbours.
+    assert not (track.flags & int(PoseFlag.IMPACT)).any()
 
 
 def test_a_gap_through_which_the_camera_saw_nothing_is_not_filled():

@@ -96,6 +96,17 @@ def _spline(
     return CubicSpline(knots, at_knots)
 
 
+def _impacts(t_s: FloatArray, values: FloatArray, spline: CubicSpline[Any], period_s: float) -> FloatArray:
+    """Return the pulses of samples, see `roughness`; across a gap the spline stands for the neighbours."""
+    missing = np.flatnonzero(np.diff(t_s) > _GAP_PERIODS * period_s)
+    if not missing.size:
+        return roughness(values)[1]
+    between = [fill_instants(a, b, period_s) for a, b in zip(t_s[missing], t_s[missing + 1], strict=True)]
+    even_s = np.concatenate([t_s, *between])
+    order = np.argsort(even_s)
+    return np.asarray(roughness(spline(even_s[order]))[1][order < len(t_s)])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSignal:
     """Angular rate and specific force of one run as cubic splines of time.
@@ -159,10 +170,9 @@ class ImuSignal:
         interval = np.diff(t_s)
         period_s = float(np.median(interval))
         # Steady roughness before sharpening: what that adds to noise lies high, and is gone once integrated.
-        (gyro_steady, gyro_impact), (acc_steady, acc_impact) = roughness(gyro), roughness(acc)
+        gyro_steady, acc_steady = roughness(gyro)[0], roughness(acc)[0]
         if gyro_filter_s > 0:
             gyro = sharpened(t_s, gyro, gyro_filter_s)
-            gyro_impact = roughness(gyro)[1]
         missing = np.flatnonzero(interval > _GAP_PERIODS * period_s)
         fill = samples.fill
         gyro_spline = _spline(t_s, gyro, period_s, None if fill is None else (fill.t_s, fill.gyro_radps))
@@ -174,8 +184,8 @@ class ImuSignal:
             acc_mps2=acc,
             gyro_roughness_radps=gyro_steady,
             acc_roughness_mps2=acc_steady,
-            gyro_impact_radps=gyro_impact,
-            acc_impact_mps2=np.maximum(acc_impact, samples.filled_sd_mps2),
+            gyro_impact_radps=_impacts(t_s, gyro, gyro_spline, period_s),
+            acc_impact_mps2=np.maximum(_impacts(t_s, acc, acc_spline, period_s), samples.filled_sd_mps2),
             gyro_bridge_radps=bridge_error(gyro),
             acc_bridge_mps2=bridge_error(acc),
             gaps_s=np.stack([t_s[missing], t_s[missing + 1]], axis=1),
@@ -196,7 +206,9 @@ class ImuSignal:
         return replace(
             self,
             acc_mps2=acc,
-            acc_impact_mps2=np.maximum(roughness(acc)[1], samples.filled_sd_mps2),
+            acc_impact_mps2=np.maximum(
+                _impacts(samples.t_s, acc, spline, self.period_s), samples.filled_sd_mps2
+            ),
             acc_bridge_mps2=bridge_error(acc),
             _acc=spline,
             _acc_integral=spline.antiderivative(),

@@ -77,15 +77,16 @@ def noise_parts(
 
     points = t_s[:-1] + np.diff(t_s, axis=0) * ((np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS)[:, None]
 
-    def at(values: FloatArray, shift_s: float) -> FloatArray:
-        return np.asarray(np.interp(points + shift_s, signal.t_s, values).mean(axis=0))
-
-    lost = signal.in_gap(points, least_periods=_ONE_MISSING)
     fill = signal.samples.fill
-    filled = np.zeros(lost.shape, dtype=np.bool_) if fill is None else fill.covers(points)
-    gap = hold * (lost & ~filled).mean(axis=0)
+    filled = np.zeros(points.shape, dtype=np.bool_) if fill is None else fill.covers(points)
     fill_gyro, fill_acc = (0.0, 0.0) if fill is None else (fill.gyro_density, fill.acc_density)
-    bridged = period * signal.in_gap(points).mean(axis=0)
+
+    def at(values: FloatArray, shift_s: float) -> FloatArray:
+        """Return the mean over a step, but for what of it is filled: there no sample tells."""
+        return np.asarray((np.interp(points + shift_s, signal.t_s, values) * ~filled).mean(axis=0))
+
+    gap = hold * (signal.in_gap(points, least_periods=_ONE_MISSING) & ~filled).mean(axis=0)
+    bridged = period * (signal.in_gap(points) & ~filled).mean(axis=0)
     gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
     shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
     acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2

@@ -128,8 +128,8 @@ class Estimate:
     led_residual_px, led_cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
         Of each LED at the state of its node: seen less predicted, and H P H^T; empty where there are no LEDs.
     doubt : ndarray, shape (K, B, c, q), or None
-        Of errors that stand still, in q independent parts, where ``covariance`` holds them too: what one sd of
-        each moves the states ``of`` by, over the whole run.
+        Of errors that stand still, in q independent parts, where ``covariance`` holds them too: what one sd
+        of each moves the states ``of`` by, over the whole run.
     """
 
     state: State
