@@ -196,10 +196,8 @@ class _Steps(NamedTuple):
         )
 
     def price(self) -> float:
-        """Return the log-likelihood to be earned; systematic errors of both that go together count once."""
-        acc, gyro = self.acc_systematic, self.gyro_systematic
-        n = abs(self.acc_rough) + abs(self.gyro_rough) + max(abs(acc), abs(gyro)) + abs(acc - gyro)
-        return _EARN_PER_STEP * n
+        """Return the log-likelihood to be earned."""
+        return _EARN_PER_STEP * sum(abs(n) for n in self)
 
     def levels(self, settings: FusionSettings) -> tuple[NoiseLevel, NoiseLevel]:
         """Return the levels of gyro and accelerometer."""
@@ -212,11 +210,10 @@ class _Steps(NamedTuple):
 
 _NOT_ALLOWED = _Steps(acc_rough=1)
 _WAYS = (
-    _Steps(acc_systematic=1, gyro_systematic=1),
+    _Steps(acc_systematic=1),
     _Steps(gyro_systematic=1),
     _Steps(acc_rough=1),
     _Steps(gyro_rough=1),
-    _Steps(acc_systematic=1),
 )
 
 
@@ -228,7 +225,8 @@ def _choose_noise(
     And the last state of the filter that has them, shape (22,).
 
     The roughness of a sensor may count for less than stated, its systematic errors for more or less. One way
-    after the other is walked step by step, down and else up, as long as each step earns its price.
+    after the other is walked step by step, down and else up, as long as each step earns its price. Each
+    sensor goes for itself: what the frames say of the accelerometer is no word on a gyro.
     """
     chosen = [_Steps()] * len(parts)
     best, last = _earned(problem, parts, chosen, settings)
