@@ -28,7 +28,7 @@ from bricktrack_host.fusion.smoothing.smoother import (
 )
 
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
-_LEAST_SYSTEMATIC, _MOST_SYSTEMATIC = -4, 2  # steps: from a fortieth of what is stated to six times that
+_LEAST_SYSTEMATIC, _MOST_SYSTEMATIC = -6, 2  # steps: from a 250th of what is stated to six times that
 _LEAST_ROUGH = -4
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
 _MAX_SCALE_ROUNDS = 4
