@@ -11,6 +11,7 @@ from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.tracks import FusedTrack
 
+MUCH_DROPPED = 0.01  # of the frames; one now and then harms nothing
 POOR_RESIDUAL_PX = 0.5  # several times what centroids of sharp dots and LEDs scatter, about 0.06 px
 GAP_PERIODS = 1.5  # a longer time between two frame stamps is a dropped frame
 
@@ -159,6 +160,12 @@ def _flag_problems(result: RunResult, figures: KeyFigures) -> list[str]:
         found.append(
             f"LEDs lie {figures.residual_rms_px:.2f} px rms from where the poses put them, where 0.1 px is "
             "usual: check the layout, the calibration and the LED profile"
+        )
+    n_expected = figures.n_frames + figures.n_frames_dropped
+    if figures.n_frames_dropped > MUCH_DROPPED * n_expected:
+        found.append(
+            f"the camera dropped {figures.n_frames_dropped} of {n_expected} frames: the motion between them is "
+            "the inertial sensor's alone. 'bricktrackd check' on the unit tells whether it keeps up"
         )
     if count(PoseFlag.LED_PROFILE_UNKNOWN):
         found.append(

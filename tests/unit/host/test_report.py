@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from bricktrack_common.arrays import rows_of
 from bricktrack_common.clocks import ClockTriplet
 from bricktrack_common.errors import StorageError
 from bricktrack_common.run_manifest import ClocksSection
@@ -195,6 +196,18 @@ def test_flags_of_the_whole_run_become_words(result):
     assert f"LEDs lie {20 * key_figures(result).residual_rms_px:.2f} px" in said
     assert "no profile of these LEDs" in said and "never fitted" not in said
     assert "7 poses use rays" in said
+
+
+def test_frames_that_a_camera_dropped_are_named(result):
+    def said_of(frames):
+        part = replace(
+            result, observations=rows_of(result.observations, frames), optical=rows_of(result.optical, frames)
+        )
+        return " ".join(verdict(part, key_figures(part))[1])
+
+    whole = np.arange(60)
+    assert "dropped" not in said_of(whole)
+    assert "the camera dropped 10 of 60 frames" in said_of(whole[(whole < 30) | (whole >= 40)])
 
 
 def test_poses_that_the_fusion_did_not_believe_count_as_time_without_a_pose(result):
