@@ -9,6 +9,7 @@ import typer
 from bricktrack_common.errors import CalibrationError, ConfigError
 
 if TYPE_CHECKING:
+    from bricktrack_common.arrays import FloatArray
     from bricktrack_common.brick_model import BrickModel
     from bricktrack_host.tracking.led_fit import CollarFit
     from bricktrack_host.tracking.led_positions import PositionsFit
@@ -43,6 +44,9 @@ def leds(
     With --positions the LEDs' places are refined from the same frames. Pictures tell the pattern's shape
     only: the first LED stays the origin, and the others as a whole are neither turned about it nor made
     larger.
+
+    An LED that is elsewhere than all the others say, in every frame alike (dirty, half covered, set beside
+    its place), is named and left out of the fit; with --positions it counts where it is found.
 
     For example:
 
@@ -92,7 +96,7 @@ def leds(
             moved = replace(brick, led_positions_mm=places.positions_mm)
             fit = fit_collar(observations, rays, moved, start_mm=places.collar_mm)
             fit = replace(fit, sd_mm=max(fit.sd_mm, places.collar_sd_mm))
-        _show_collar(fit, simulated)
+        _show_collar(fit, brick, simulated)
         if not fit.is_believable:
             raise CalibrationError(
                 f"{run}: the recording does not tell the profile: left-out frames fit no better with it. "
@@ -102,7 +106,7 @@ def leds(
             f"\n\n[led_profile]\ncollar_mm = {fit.collar_mm:.4f}\n"
             f"shift_sd_per_radius = {fit.shift_sd_per_radius:.5f}\n"
             f'source = "fitted from {recording.manifest.run_id}, {fit.n_frames} frames{simulated}, '
-            f'sd {fit.sd_mm:.3f} mm"'
+            f'sd {fit.sd_mm:.3f} mm{_without(fit, brick)}"'
         )
     if places is not None:
         _show_positions(places, brick, simulated)
@@ -117,9 +121,25 @@ def leds(
     out.print(f"layout written: {output}", markup=False, soft_wrap=True)
 
 
-def _show_collar(fit: "CollarFit", simulated: str) -> None:
+def _without(fit: "CollarFit", brick: "BrickModel") -> str:
+    """Return the names of LEDs left out, for the file."""
+    names = [name for name, px in zip(brick.led_names, fit.left_out_px, strict=True) if px > 0]
+    return f", without {', '.join(names)}" if names else ""
+
+
+def _show_left_out(left_out_px: "FloatArray", brick: "BrickModel") -> None:
+    from bricktrack_host.cli._console import out
+    from bricktrack_host.tracking.sweep_frames import words_on_left_out
+
+    words = words_on_left_out(left_out_px, brick)
+    if words:
+        out.print(words, style="yellow", markup=False, soft_wrap=True)
+
+
+def _show_collar(fit: "CollarFit", brick: "BrickModel", simulated: str) -> None:
     from bricktrack_host.cli._console import out
 
+    _show_left_out(fit.left_out_px, brick)
     out.print(
         f"collar: {fit.collar_mm:.3f} +- {fit.sd_mm:.3f} mm, from {fit.n_leds} LEDs in {fit.n_frames} "
         f"frames{simulated}; the light's middle is then known to {100 * fit.shift_sd_per_radius:.2f} % of "
@@ -136,6 +156,7 @@ def _show_positions(fit: "PositionsFit", brick: "BrickModel", simulated: str) ->
 
     from bricktrack_host.cli._console import out
 
+    _show_left_out(fit.left_out_px, brick)
     table = Table(
         title=f"LED positions from {fit.n_frames} frames{simulated}, mm: change from the layout, +- sd"
     )
@@ -143,9 +164,17 @@ def _show_positions(fit: "PositionsFit", brick: "BrickModel", simulated: str) ->
         table.add_column(name, justify="left" if name == "LED" else "right")
     change = fit.positions_mm - brick.led_positions_mm
     table.add_row(brick.led_names[0], "origin", "", "")
-    for name, moved, sd in zip(brick.led_names[1:], change[1:], fit.sd_mm[1:], strict=True):
-        table.add_row(name, *(f"{m:+.3f} +- {s:.3f}" for m, s in zip(moved, sd, strict=True)))
+    for k in range(1, brick.n_leds):
+        told = (f"{m:+.3f} +- {s:.3f}" for m, s in zip(change[k], fit.sd_mm[k], strict=True))
+        table.add_row(brick.led_names[k], *(("left out", "", "") if fit.left_out_px[k] > 0 else told))
     out.print(table)
+    odd = ", ".join(name for name, px in zip(brick.led_names, fit.odd_px, strict=True) if px > 0)
+    if odd:
+        out.print(
+            f"LED {odd}: not where the layout has it, by all the others. If it is dirty or half covered "
+            "rather than misplaced, clean it and record anew: its place here is that of the light as it was",
+            style="yellow", markup=False, soft_wrap=True,
+        )  # fmt: skip
     out.print(
         f"residuals of frames left out of the fit: {fit.cross_validated_rms_px:.3f} px; "
         f"{fit.rms_before_px:.3f} px with the layout's positions"

@@ -99,7 +99,10 @@ def frame_errors(
             twist_dt = motion.dt_s[frames][..., None] * motion.twist_sd[frames][:, None]
     prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_of(brick_model))
     shift = prediction.model_shift_px
-    pixels = observations.cov_px2[frames] - FLOOR_SD_PX**2 * np.eye(2)
+    # Centroids from elsewhere may be stated better than the floor: then nothing is left beside it.
+    stated = observations.cov_px2[frames]
+    floor_px2 = np.minimum(FLOOR_SD_PX**2, np.linalg.eigvalsh(stated)[..., 0])
+    pixels = stated - floor_px2[..., None, None] * np.eye(2)
     return FrameErrors(
         seen=seen,
         error_px=np.where(seen[..., None], first.uv_px[frames] - prediction.uv_px, 0.0),

@@ -18,11 +18,18 @@ from bricktrack_host.tracking.led_model.led_profile import (
     predict_brick,
     shift_per_radius,
 )
+from bricktrack_host.tracking.odd_leds import oddest_led
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.first_poses import FirstPoses, first_poses
 from bricktrack_host.tracking.pose.frame_motion import calm_frames, carried_px, led_times_ns, motion_to_leds
 from bricktrack_host.tracking.pose.refine import OWN_SHARE, RefinedPoses, refine_poses
-from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
+from bricktrack_host.tracking.sweep_frames import (
+    errors_of_sweep,
+    rms_px,
+    sweep_frames,
+    without_led,
+    words_on_left_out,
+)
 from bricktrack_host.tracks import LedObservations
 
 _MIN_LEDS = 5  # four leave two degrees of freedom, which one collar and a false pose share too easily
@@ -40,7 +47,7 @@ _SELF_FIT_SHIFT_SD = 0.005
 _MAX_SELF_FIT_FRAMES = 60
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class CollarFit:
     """A fitted collar.
 
@@ -61,6 +68,8 @@ class CollarFit:
         Of the same frames with a sphere's centroid in place of the profile.
     n_frames, n_leds : int
         Frames, and LEDs in them, that were used.
+    left_out_px : ndarray, shape (n_leds of the layout,), px
+        How far LEDs that were left out are from where the others put them; 0 of those used.
     """
 
     collar_mm: float
@@ -71,6 +80,7 @@ class CollarFit:
     rms_without_px: float
     n_frames: int
     n_leds: int
+    left_out_px: FloatArray
 
     @property
     def is_believable(self) -> bool:
@@ -106,20 +116,16 @@ def fit_collar(
     Raises
     ------
     CalibrationError
-        If fewer than five frames show five LEDs, the views do not determine the collar, or the fit leaves
-        the range from 0 to ``max_collar_radii``.
+        If fewer than five frames show five LEDs that agree, the views do not determine the collar, or the fit
+        leaves the range from 0 to ``max_collar_radii``.
 
     Notes
     -----
-    Gauss-Newton on the collar with the poses eliminated in every frame (variable projection).
+    Gauss-Newton on the collar with the poses eliminated in every frame (variable projection). LEDs that all
+    the others contradict are left out, the worst first, and the collar is fitted anew.
     """
-    sweep = sweep_frames(
-        observations, wanted="the LED profile needs", min_leds=_MIN_LEDS, min_frames=_MIN_FRAMES
-    )
+    sweep, problem, collar, left_out_px = _without_odd_leds(observations, ray_model, brick_model, start_mm)
     uv = sweep.uv_px
-    problem = _Problem(sweep, ray_model, brick_model)
-    everything = np.ones(len(uv), dtype=bool)
-    collar = problem.solve(everything, start_mm)
     longest = max_collar_radii * float(brick_model.led_radii_mm.max())
     if -_BARELY_NEGATIVE_MM <= collar < 0:
         collar = 0.0  # a bare dome whose limb is not as dark as its middle is bright
@@ -149,7 +155,38 @@ def fit_collar(
         rms_without_px=rms_px(without),
         n_frames=len(uv),
         n_leds=int(np.isfinite(uv[..., 0]).sum()),
+        left_out_px=left_out_px,
     )
+
+
+def _without_odd_leds(
+    observations: LedObservations, ray_model: RayModel, brick_model: BrickModel, start_mm: float
+) -> tuple[LedObservations, "_Problem", float, FloatArray]:
+    """Return a sweep's LEDs that agree, their problem and collar, and how far off those left out are, px."""
+    left_out_px = np.zeros(brick_model.n_leds)
+    sweep = observations
+    while True:
+        try:
+            sweep = sweep_frames(
+                sweep, wanted="the LED profile needs", min_leds=_MIN_LEDS, min_frames=_MIN_FRAMES
+            )
+        except CalibrationError as e:
+            if not left_out_px.any():
+                raise
+            raise CalibrationError(f"{words_on_left_out(left_out_px, brick_model)} Then: {e}") from e
+        problem = _Problem(sweep, ray_model, brick_model)
+        collar = problem.solve(np.ones(len(sweep.uv_px), dtype=np.bool_), start_mm)
+        shown = ProfileEntry(
+            collar_mm=max(collar, 0.0), source="being fitted", shift_sd_per_radius=LEAST_SHIFT_SD
+        )
+        errors = errors_of_sweep(
+            sweep, problem.poses(shown.collar_mm), ray_model, replace(brick_model, led_profile=shown)
+        )
+        odd = oddest_led(errors, errors.seen)
+        if odd is None:
+            return sweep, problem, collar, left_out_px
+        left_out_px[odd[0]] = odd[1]
+        sweep = without_led(sweep, odd[0])
 
 
 def with_profile_of_run(

@@ -3,7 +3,8 @@
 What pictures can tell is the shape of the pattern, not where it lies: every frame has a pose of its own, and
 a camera whose rays meet in a point sees a larger brick farther away alike. So the gauge is stated: the first
 LED stays the origin, and against the layout as given the others are, as a whole, neither turned about it nor
-made larger. Judged by cross-validation, as the profile is.
+made larger. LEDs that all the others contradict do not count in that, or one that is set beside its place
+would move the rest. Judged by cross-validation, as the profile is.
 """
 
 from dataclasses import dataclass, replace
@@ -11,15 +12,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_common.brick_model import BrickModel
+from bricktrack_common.brick_model import BrickModel, ProfileEntry
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import CalibrationError
 from bricktrack_common.rotations import skew
-from bricktrack_host.tracking.led_model.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.frame_errors import FrameErrors
+from bricktrack_host.tracking.led_model.led_profile import collar_of, predict_brick, shift_per_radius
+from bricktrack_host.tracking.odd_leds import odd_leds_px, oddest_led
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.first_poses import first_poses
 from bricktrack_host.tracking.pose.refine import RefinedPoses, refine_poses
-from bricktrack_host.tracking.sweep_frames import rms_px, sweep_frames
+from bricktrack_host.tracking.sweep_frames import (
+    errors_of_sweep,
+    rms_px,
+    sweep_frames,
+    without_led,
+    words_on_left_out,
+)
 from bricktrack_host.tracks import LedObservations
 
 _MIN_LEDS = 6  # five tell of a pose and four coordinates more, of twelve that are sought
@@ -28,6 +37,7 @@ _N_FOLDS = 5
 _MAX_ROUNDS = 20
 _STEP_MM = 0.02
 _LONGEST_STEP_MM = 0.5
+_HARDLY = 30.0  # an LED that all the others contradict is anywhere
 _HELD = 1e12  # 1/mm^2: the collar stays where it is
 _SETTLED_MM = 1e-4
 _OUTLIER_SIGMAS = 5.0
@@ -51,6 +61,10 @@ class PositionsFit:
     rms_before_px : float
         With the positions of the layout.
     n_frames : int
+    odd_px : ndarray, shape (n_leds,), px
+        How far LEDs that the layout puts elsewhere than all the others say are from there; 0 of the others.
+    left_out_px : ndarray, shape (n_leds,), px
+        The same of LEDs that no place explains, and that were left out: theirs is the layout's.
     """
 
     positions_mm: FloatArray
@@ -61,6 +75,8 @@ class PositionsFit:
     cross_validated_rms_px: float
     rms_before_px: float
     n_frames: int
+    odd_px: FloatArray
+    left_out_px: FloatArray
 
     @property
     def is_believable(self) -> bool:
@@ -94,8 +110,8 @@ def fit_positions(
     Raises
     ------
     CalibrationError
-        If the profile is not known, fewer than ten frames show six LEDs, an LED fits nowhere, or a position
-        goes five tolerances away.
+        If the profile is not known, fewer than ten frames show six LEDs that agree, the first LED is not
+        where the others say, or a position goes five tolerances away.
 
     Notes
     -----
@@ -106,24 +122,32 @@ def fit_positions(
             f"the layout '{brick_model.name}' has no [led_profile]; domes would pass for other places. "
             "Fit the profile first"
         )
-    sweep = sweep_frames(
-        observations, wanted="LED positions need", min_leds=_MIN_LEDS, min_frames=_MIN_FRAMES
-    )
+    sweep, odd_px = _sweep(observations), np.zeros(brick_model.n_leds)
+    problem = _Problem(sweep, ray_model, brick_model, tolerance_mm, with_collar, odd_px == 0)
+    odd_px = odd_leds_px(problem.errors(problem.start))
+    if odd_px[0] > 0:
+        raise CalibrationError(
+            f"LED {brick_model.led_names[0]}, from which all the others are measured, is {odd_px[0]:.2f} px "
+            "from where they put it, in every frame alike. Is it clean and uncovered, and are its place and "
+            "axis right in the layout?"
+        )
+    left_out_px = np.zeros(brick_model.n_leds)
+    while True:
+        problem = _Problem(sweep, ray_model, brick_model, tolerance_mm, with_collar, odd_px == 0)
+        solved = problem.solve(np.ones(len(sweep.uv_px), dtype=np.bool_))
+        errors = problem.errors(solved)
+        odd = oddest_led(errors, errors.seen)
+        if odd is None:
+            break
+        odd_px[odd[0]] = left_out_px[odd[0]] = odd[1]
+        try:
+            sweep = _sweep(without_led(sweep, odd[0]))
+        except CalibrationError as e:
+            raise CalibrationError(f"{words_on_left_out(left_out_px, brick_model)} Then: {e}") from e
     uv = sweep.uv_px
-    problem = _Problem(sweep, ray_model, brick_model, tolerance_mm, with_collar)
-    everything = np.ones(len(uv), dtype=np.bool_)
-    solved = problem.solve(everything)
     positions = problem.positions_mm(solved)
     sd_mm, collar_sd_mm = problem.sd_mm(solved)
     poses = problem.poses(solved)
-    with np.errstate(invalid="ignore"):
-        strange = (poses.sigmas > _OUTLIER_SIGMAS).sum(axis=0) / np.maximum(all_finite(uv).sum(axis=0), 1)
-    if strange.max() > 0.5:
-        k = int(strange.argmax())
-        raise CalibrationError(
-            f"LED {brick_model.led_names[k]} is beyond belief in {100 * strange[k]:.0f} % of the frames, "
-            "wherever it is put. Check its position, axis and name in the layout"
-        )
     off_mm = np.linalg.norm(positions - brick_model.led_positions_mm, axis=1)
     if not off_mm.max() < 5 * tolerance_mm:
         k = int(np.nanargmax(off_mm))
@@ -145,15 +169,23 @@ def fit_positions(
         cross_validated_rms_px=rms_px(held_out),
         rms_before_px=rms_px(problem.poses(problem.start).residual_px),
         n_frames=len(uv),
+        odd_px=np.where(left_out_px > 0, 0.0, odd_px),
+        left_out_px=left_out_px,
     )
 
 
-def free_directions(positions_mm: FloatArray) -> FloatArray:
+def _sweep(observations: LedObservations) -> LedObservations:
+    return sweep_frames(observations, wanted="LED positions need", min_leds=_MIN_LEDS, min_frames=_MIN_FRAMES)
+
+
+def free_directions(positions_mm: FloatArray, counts: BoolArray | None = None) -> FloatArray:
     """Return an orthonormal basis of the changes that the gauge leaves, shape (3 n_leds, 3 n_leds - 7).
 
-    Orthogonal to: any change of the first LED, turns about it, and a change of scale.
+    Orthogonal to: any change of the first LED, turns about it, and a change of scale, of those that count.
     """
     n_leds = len(positions_mm)
+    if counts is not None:
+        positions_mm = np.where(counts[:, None], positions_mm, 0.0)
     fixed = np.zeros((3 * n_leds, 7))
     fixed[:3, :3] = np.eye(3)
     fixed[:, 3:6] = skew(positions_mm).reshape(3 * n_leds, 3)
@@ -176,15 +208,22 @@ class _Problem:
         brick_model: BrickModel,
         tolerance_mm: float,
         with_collar: bool,
+        counts: BoolArray,
     ) -> None:
+        self._sweep = sweep
         self._uv, self._cov = sweep.uv_px, sweep.cov_px2
         self._rays, self._brick = ray_model, brick_model
+        self._shift_sd = shift_per_radius(collar_of(brick_model), brick_model)
         self._nominal = brick_model.led_positions_mm
-        self._free = free_directions(self._nominal)
+        self._free = free_directions(self._nominal, counts)
         self._tolerance_mm = tolerance_mm
         n = self._free.shape[1]
         self.start = np.append(np.zeros(n), collar_of(brick_model) or 0.0)
-        self._prior = np.diag(np.append(np.full(n, tolerance_mm**-2), 0.0 if with_collar else _HELD))
+        self._looseness = np.where(counts, 1.0, _HARDLY)
+        precision = np.repeat((tolerance_mm * self._looseness) ** -2, 3)
+        self._prior = np.zeros((n + 1, n + 1))
+        self._prior[:n, :n] = self._free.T @ (precision[:, None] * self._free)
+        self._prior[n, n] = 0.0 if with_collar else _HELD
         apart_px = np.nanstd(self._uv, axis=1).max()
         self._px_per_mm = float(apart_px / np.std(self._nominal, axis=0).max())
         loose = self._covariance(tolerance_mm)
@@ -195,6 +234,14 @@ class _Problem:
         """Return the positions, shape (n_leds, 3)."""
         return self._nominal + (self._free @ x[:-1]).reshape(-1, 3)
 
+    def errors(self, x: FloatArray) -> FrameErrors:
+        """Return the errors of the frames with these positions and this collar."""
+        profile = ProfileEntry(
+            collar_mm=max(float(x[-1]), 0.0), source="being fitted", shift_sd_per_radius=self._shift_sd
+        )
+        brick = replace(self._brick, led_positions_mm=self.positions_mm(x), led_profile=profile)
+        return errors_of_sweep(self._sweep, self.poses(x), self._rays, brick)
+
     def poses(self, x: FloatArray, loose_mm: float = 0.0) -> RefinedPoses:
         """Return the poses and residuals for positions that are believed to ``loose_mm``."""
         brick = replace(self._brick, led_positions_mm=self.positions_mm(x))
@@ -203,7 +250,8 @@ class _Problem:
         return refine_poses(self._uv, cov, self._R, self._t, self._rays, brick, collar_mm=collar_mm)
 
     def _covariance(self, loose_mm: float) -> FloatArray:
-        return np.asarray(self._cov + (loose_mm * self._px_per_mm) ** 2 * np.eye(2))
+        loose_px = loose_mm * self._px_per_mm * self._looseness
+        return np.asarray(self._cov + (loose_px**2)[:, None, None] * np.eye(2))
 
     def _equations(self, x: FloatArray, loose_mm: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Return each frame's normal matrix and right side, (n, m, m) and (n, m)."""

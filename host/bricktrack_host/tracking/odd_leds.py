@@ -68,19 +68,22 @@ def odd_leds_px(errors: FrameErrors) -> FloatArray:
     the others put it, and its covariance. Its square beside the noise of the others follows F. All frames
     count as one: the error stands. The worst first, while five others remain.
     """
-    n_leds = errors.seen.shape[1]
-    off_px = np.zeros(n_leds)
+    off_px = np.zeros(errors.seen.shape[1])
     leds = errors.seen.copy()
-    while True:
-        found = [(k, *_beside_the_others(errors, leds, k)) for k in range(n_leds) if leds[:, k].any()]
-        odd = [
-            (k, px, px / noise_px) for k, px, noise_px, chance in found if chance < _CHANCE and px > _LEAST_PX
-        ]
-        if not odd:
-            return off_px
-        k, px, _ = max(odd, key=lambda each: each[2])
-        off_px[k] = px
+    while (odd := oddest_led(errors, leds)) is not None:
+        k, off_px[k] = odd
         leds[:, k] = False
+    return off_px
+
+
+def oddest_led(errors: FrameErrors, leds: BoolArray) -> tuple[int, float] | None:
+    """Return the LED that is oddest beside some of each frame's, (n, n_leds), and how far off it is, px.
+
+    None where that of every LED may be chance. See `odd_leds_px`.
+    """
+    found = [(k, *_beside_the_others(errors, leds, k)) for k in np.flatnonzero(leds.any(axis=0)).tolist()]
+    odd = [(px / noise_px, k, px) for k, px, noise_px, chance in found if chance < _CHANCE and px > _LEAST_PX]
+    return max(odd)[1:] if odd else None
 
 
 def _beside_the_others(errors: FrameErrors, leds: BoolArray, k: int) -> tuple[float, float, float]:

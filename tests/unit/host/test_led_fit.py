@@ -9,6 +9,7 @@ from bricktrack_common.errors import CalibrationError
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracking.led_fit import fit_collar, with_profile_of_run
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
+from bricktrack_host.tracking.sweep_frames import words_on_left_out
 from bricktrack_host.tracks import LedObservations
 
 CAMERA = PinholeCamera()
@@ -57,6 +58,38 @@ def test_leds_in_nearly_one_plane_tell_their_collar_too():
     fit = fit_collar(sweep(0.9, brick=flat), CAMERA, flat)
     assert fit.collar_mm == pytest.approx(0.9, abs=4 * fit.sd_mm + 0.02)
     assert fit.n_frames == 12
+
+
+@pytest.mark.parametrize("off_px", [(0.3, 0.0), (1.0, -0.5), (8.0, 0.0)])
+def test_a_dirty_led_is_named_and_left_out(off_px):
+    seen = sweep(0.9)
+    dirty = replace(seen, uv_px=seen.uv_px.copy())
+    dirty.uv_px[:, 3] += off_px
+    clean = replace(seen, uv_px=seen.uv_px.copy())
+    clean.uv_px[:, 3] = np.nan
+    fit, without = fit_collar(dirty, CAMERA, BRICK), fit_collar(clean, CAMERA, BRICK)
+    assert np.flatnonzero(fit.left_out_px).tolist() == [3]
+    # Each of u and v; some of it turns the pose that the others share in no test of this LED.
+    assert fit.left_out_px[3] == pytest.approx(np.hypot(*off_px) / np.sqrt(2), rel=0.15)
+    assert fit.collar_mm == pytest.approx(without.collar_mm, abs=1e-6)
+    assert fit.n_leds == 72
+    assert fit.is_believable
+    assert "LED m3 (" in words_on_left_out(fit.left_out_px, BRICK)
+
+
+def test_clean_leds_are_all_used():
+    for seed in range(2, 7):
+        assert not fit_collar(sweep(0.9, n=8, seed=seed), CAMERA, BRICK).left_out_px.any()
+
+
+def test_more_dirty_leds_than_the_others_can_outvote_are_refused():
+    seen = sweep(0.9)
+    seen.uv_px[:, 6] = np.nan  # six are left, of which one may be odd
+    seen.uv_px[:, 2] += [4.0, 0.0]
+    assert np.flatnonzero(fit_collar(seen, CAMERA, BRICK).left_out_px).tolist() == [2]
+    seen.uv_px[4:, 5] = np.nan  # without it, five are in four frames only
+    with pytest.raises(CalibrationError, match=r"left out: LED m2 .* Then: 4 frames with 5"):
+        fit_collar(seen, CAMERA, BRICK)
 
 
 def test_too_few_frames_are_refused():
