@@ -164,8 +164,8 @@ def _flag_problems(result: RunResult, figures: KeyFigures) -> list[str]:
     n_expected = figures.n_frames + figures.n_frames_dropped
     if figures.n_frames_dropped > MUCH_DROPPED * n_expected:
         found.append(
-            f"the camera dropped {figures.n_frames_dropped} of {n_expected} frames: the motion between them is "
-            "the inertial sensor's alone. 'bricktrackd check' on the unit tells whether it keeps up"
+            f"the camera dropped {figures.n_frames_dropped} of {n_expected} frames: the motion between them "
+            "is the inertial sensor's alone. 'bricktrackd check' on the unit tells whether it keeps up"
         )
     if count(PoseFlag.LED_PROFILE_UNKNOWN):
         found.append(

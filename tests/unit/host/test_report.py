@@ -206,7 +206,7 @@ def test_frames_that_a_camera_dropped_are_named(result):
         return " ".join(verdict(part, key_figures(part))[1])
 
     whole = np.arange(60)
-    assert "dropped" not in said_of(whole)
+    assert "the camera dropped" not in said_of(whole)
     assert "the camera dropped 10 of 60 frames" in said_of(whole[(whole < 30) | (whole >= 40)])
 
 
