@@ -12,7 +12,7 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led import led_smoothing
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_smoothing import smooth_leds
-from bricktrack_host.fusion.led_by_led.standing_errors import StandingWay
+from bricktrack_host.fusion.led_by_led.standing_errors import StandingWay, _likeliest
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.fusion.smoothing.smoother import POS, Filter
 from bricktrack_host.tracking.optical_track import solve_poses
@@ -30,6 +30,17 @@ def smoothed(run):
     return smooth_leds(leds, first, run.camera, run.brick, lever_arm_m=arm_m, settings=SETTINGS)
 
 
+def plain_run():
+    """Return a simulated run without standing errors."""
+    run = simulate_run(31, duration_s=4.0)
+    return replace(run, brick=replace(run.brick, led_profile=ProfileEntry(collar_mm=0.7, source="simulated")))
+
+
+def origin_m(states):
+    """Return where the brick's origin is at the nodes, shape (K, 3)."""
+    return states.estimate.state.x[:, 0, POS] - states.estimate.state.R[:, 0] @ states.run.lever_arm_m
+
+
 @pytest.fixture(scope="module")
 def plain():
     """Return a run without standing errors, and its last pass, with what it was made of."""
@@ -40,11 +51,9 @@ def plain():
         passes.append(whole(*args))
         return passes[-1]
 
-    run = simulate_run(31, duration_s=4.0)
-    run = replace(run, brick=replace(run.brick, led_profile=ProfileEntry(collar_mm=0.7, source="simulated")))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(led_smoothing, "_pass", keep)
-        done = smoothed(run)
+        done = smoothed(plain_run())
     return done, passes[-1]
 
 
@@ -64,7 +73,7 @@ def test_the_derivative_of_the_smoothed_motion_is_that_of_the_filter(plain):
     # An LED seen 0.1 px off all the time. With noise three times what it is nothing surprises the filter, which
     # would believe it less.
     done, last = plain
-    now, leds = last.states, last.leds
+    now, leds = last.states, done.leds
     arrays = now.problem.leds._replace(cov_px2=9 * now.problem.leds.cov_px2)
     problem = replace(now.problem, leds=arrays)
     passed = Filter(problem)
@@ -80,6 +89,38 @@ def test_the_derivative_of_the_smoothed_motion_is_that_of_the_filter(plain):
     # Of the largest; each LED moves the state at which the next is linearised.
     assert np.abs(found - shift_m / 0.1).max() < 0.04 * found.max()
     assert found.max() > 1e-6
+
+
+def test_the_likeliest_errors_are_those_of_the_dense_gaussian_formulas():
+    # Direct: y = -A e + noise of one, e about zero with covariance P; the likelihood is that of y itself.
+    rng = np.random.default_rng(8)
+    A, known = rng.normal(size=(12, 5)), np.array([0.3, -0.2, 0.1, 0.4, 0.0])
+    sd = np.array(
+        [[0.5, 2.0, 0.3, 0.0, 1.0], [1.5, 0.1, 0.3, 0.0, 1.0]]
+    )  # the fourth has no variance: it stays
+    y = rng.normal(size=12)
+    prior = sd[:, :, None] ** 2 * np.eye(5)
+    belief, value = _likeliest(prior, known, A.T @ A, A.T @ y)
+    out_already = np.where(sd[0] > 0, known, 0.0)
+    direct = []
+    for P, found in zip(prior, value, strict=True):
+        whole = y - A @ out_already  # as it was before the errors that are known were taken out
+        S = np.eye(12) + A @ P @ A.T
+        np.testing.assert_allclose(
+            found, np.where(sd[0] > 0, -P @ A.T @ np.linalg.solve(S, whole), known), atol=1e-12
+        )
+        direct.append(-0.5 * (whole @ np.linalg.solve(S, whole) + np.linalg.slogdet(S)[1]))
+    assert belief[1] - belief[0] == pytest.approx(direct[1] - direct[0], abs=1e-10)
+
+
+def test_pictures_predicted_once_serve_while_the_motion_moves_them_little(plain, monkeypatch):
+    # Predicted anew in each pass they give the same motion: apart by less than a twentieth of its sd.
+    held = plain[0]
+    monkeypatch.setattr(led_smoothing, "_PICTURES_HOLD_PX", 0.0)
+    anew = smoothed(plain_run())
+    off_m = np.abs(origin_m(held.states) - origin_m(anew.states))
+    sd_m = np.sqrt(anew.states.estimate.variance[:, 0, POS])
+    assert (off_m / sd_m).max() < 0.05
 
 
 def test_an_led_that_is_off_all_the_time_is_found():

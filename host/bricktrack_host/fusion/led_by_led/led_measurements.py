@@ -23,7 +23,7 @@ from bricktrack_host.tracking.led_model.led_profile import (
 )
 from bricktrack_host.tracking.led_tracker import NOT_USED
 from bricktrack_host.tracking.optical_track import led_times_ns
-from bricktrack_host.tracks import FusedTrack, LedObservations
+from bricktrack_host.tracks import LedObservations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +89,6 @@ class Pictured:
         One standard deviation of what the profile leaves unknown, the same way in all LEDs.
     from_centre_px : ndarray, shape (m, 2)
         The predicted picture less the middle of the sensor's.
-    px_per_s : ndarray, shape (m, 2)
-        How fast the picture moves.
     is_facing : ndarray of bool, shape (m,)
         Whether the dome can be seen at all from there.
     """
@@ -101,39 +99,32 @@ class Pictured:
     J_px: FloatArray
     profile_shift_px: FloatArray
     from_centre_px: FloatArray
-    px_per_s: FloatArray
     is_facing: BoolArray
 
 
 def picture(
     leds: SeenLeds,
-    motion: FusedTrack,
-    beside: tuple[FloatArray, FloatArray],
+    R_camera_brick: FloatArray,
+    t_camera_brick_mm: FloatArray,
     ray_model: RayModel,
     brick: BrickModel,
 ) -> Pictured:
-    """Predict seen LEDs for the motion at their instants, and rotations and positions, mm, at `beside_ns`.
+    """Predict seen LEDs for poses at their instants and at `beside_ns`, shape (3, m, 3, 3) and (3, m, 3).
 
     A brick that is accelerated is not, on the mean over the time that its light is gathered, where it is in
     the middle: by half the spread's square times the acceleration. The mean of the pictures a spread before
     and after shows as much.
     """
-    R, t_mm = motion.R_camera_brick, motion.t_camera_brick_mm
-    prediction = _predict(leds, R, t_mm, ray_model, brick)
-    before_px, after_px = (
-        _predict(leds, *pose, ray_model, brick).uv_px for pose in zip(*beside, strict=True)
-    )
-    J = _by_pose(prediction, leds, R, brick)
-    twist = np.concatenate([motion.omega_brick_radps, motion.v_camera_mmps], axis=1)
+    poses = zip(R_camera_brick, t_camera_brick_mm, strict=True)
+    prediction, before, after = (_predict(leds, R, t_mm, ray_model, brick) for R, t_mm in poses)
     mode = ray_model.sensor_mode
     return Pictured(
-        R_camera_brick=R,
-        t_camera_brick_mm=t_mm,
-        residual_px=leds.uv_px - 0.5 * (before_px + after_px),
-        J_px=J,
+        R_camera_brick=R_camera_brick[0],
+        t_camera_brick_mm=t_camera_brick_mm[0],
+        residual_px=leds.uv_px - 0.5 * (before.uv_px + after.uv_px),
+        J_px=_by_pose(prediction, leds, R_camera_brick[0], brick),
         profile_shift_px=prediction.model_shift_px,
         from_centre_px=prediction.uv_px - 0.5 * np.array([mode.width - 1, mode.height - 1]),
-        px_per_s=np.einsum("mij,mj->mi", J, twist),
         is_facing=np.asarray(prediction.facing > 0, dtype=np.bool_),
     )
 

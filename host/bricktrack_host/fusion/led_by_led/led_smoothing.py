@@ -1,6 +1,6 @@
 """The smoother LED by LED: pictures predicted, noise and standing errors found, and once more from there."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,10 +27,13 @@ from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run, build
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, relinearised
 from bricktrack_host.fusion.smoothing.smoother import Filter
-from bricktrack_host.tracks import FusedTrack
 
 _PASSES = 5
 _NOISE_CHOSEN_AFTER = 1  # pass: by then the pictures are predicted from what LEDs say
+_PICTURES_HOLD_PX = 0.2
+"""Within which a picture moves in proportion to the motion, of focal lengths about 1500 px: the square leaves
+0.0001 px, and of the few that move by a pixel, at impacts, 0.003 px."""
+_HELD_SHARE = 0.99
 _GATE_CHI2 = 20.7  # of 2 degrees of freedom; passed by all but one in 30 000
 _SCALES_STAND = 0.1  # of the logarithm
 
@@ -73,15 +76,28 @@ class _Belief:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Pass:
-    """One pass over the LEDs that could be placed, by what was believed."""
+class _Sights:
+    """LEDs with the pictures that a motion lets expect, and which of them stand still."""
 
     leds: SeenLeds
     pictured: Pictured
     still: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pass:
+    """One pass over sights by what was believed; ``pictured`` is without the errors that stand still."""
+
+    pictured: Pictured
     use: BoolArray
     states: Smoothed
     chi2: FloatArray
+
+    def holds(self) -> bool:
+        """Return whether the motion found is near to the one that the pictures were predicted for."""
+        moved_px = np.abs(self.pictured.residual_px - self.states.estimate.led_residual_px)
+        facing = moved_px[self.pictured.is_facing]
+        return not facing.size or bool(np.quantile(facing, _HELD_SHARE) < _PICTURES_HOLD_PX)
 
 
 def smooth_leds(
@@ -102,15 +118,16 @@ def smooth_leds(
     n_leds = brick_model.n_leds
     errors = StandingErrors.before(first.run, lever_arm_m, n_leds)
     belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
-    now, use = first, np.ones(len(leds.t_ns), dtype=np.bool_)
+    sights, _ = _sights(_placeable(leds, first, settings), first, ray_model, brick_model)
+    now, use = first, np.ones(len(sights.leds.t_ns), dtype=np.bool_)
     for i in range(_PASSES):
-        done = _pass(leds, use, now, first, belief, ray_model, brick_model)
-        leds, now = done.leds, done.states
+        done = _pass(sights, use, now, first, belief, n_leds)
+        leds, now = sights.leds, done.states
         prior = StandingPrior.of(leds, done.pictured, n_leds, settings)
         way = StandingWay(now.problem, now.passed, leds, done.pictured, n_leds, of=now.estimate.of)
         errors = way.estimate(prior, belief.errors.value)
-        scales = centroid_scales(done.chi2, done.still, done.use, belief.scales)
-        more = (scales / belief.scales)[done.still.astype(np.int64)]
+        scales = centroid_scales(done.chi2, sights.still, done.use, belief.scales)
+        more = (scales / belief.scales)[sights.still.astype(np.int64)]
         use = (done.chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
         stands = np.abs(np.log(scales / belief.scales)).max() < _SCALES_STAND
         is_settled = i > _NOISE_CHOSEN_AFTER and stands and np.array_equal(use, done.use)
@@ -122,26 +139,21 @@ def smooth_leds(
             levels, believed = noise.levels(levels), noise.settings(believed)
         run = belief.run.with_sensor(errors.of_sensor(since=belief.errors))
         belief = _Belief(run, scales, levels, believed, errors)
+        if not done.holds():
+            sights, placed = _sights(leds, now, ray_model, brick_model)
+            use = use[placed]
     states = replace(now, estimate=way.with_doubt(now.estimate, errors))
     return SmoothedLeds(leds, states, done.chi2, done.use, belief.scales, errors)
 
 
 def _pass(
-    leds: SeenLeds,
-    use: BoolArray,
-    now: Smoothed,
-    first: Smoothed,
-    belief: _Belief,
-    ray_model: RayModel,
-    brick_model: BrickModel,
+    sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, belief: _Belief, n_leds: int
 ) -> _Pass:
-    """Smooth once, with pictures predicted for the motion ``now``."""
-    settings = belief.settings
-    leds, pictured, placed = _pictured(leds, now, first.run.t_cam_s, ray_model, brick_model, settings)
-    use = use[placed]
-    off_px = belief.errors.in_picture_px(leds, pictured, brick_model.n_leds)
+    """Smooth once, linearised at the motion ``now``."""
+    settings, leds, pictured = belief.settings, sights.leds, sights.pictured
+    off_px = belief.errors.in_picture_px(leds, pictured, n_leds)
     pictured = replace(pictured, residual_px=pictured.residual_px - off_px)
-    still, use = still_sightings(leds), use & pictured.is_facing
+    use = use & pictured.is_facing
     lin = relinearised(now.run, now.estimate, now.b, len(now.nodes.t_s), settings)
     run = _without_frames(belief.run.with_acc_loss(lin.loss_s2))
     nodes = Nodes(place_nodes(first.run, lin).t_s, np.zeros(0, dtype=np.int64))
@@ -151,7 +163,7 @@ def _pass(
     )  # fmt: skip
     arrays = led_arrays(
         leds, pictured, run, nodes, lin, belief.levels,
-        scale=belief.scales[still.astype(np.int64)], use=use, settings=settings,
+        scale=belief.scales[sights.still.astype(np.int64)], use=use, settings=settings,
     )  # fmt: skip
     problem = replace(problem, leds=arrays)
     passed = Filter(problem)
@@ -160,30 +172,29 @@ def _pass(
         first, run=run, nodes=nodes, lin=lin, problem=problem, passed=passed, estimate=estimate, b=0,
         levels=belief.levels,
     )  # fmt: skip
-    return _Pass(leds, pictured, still, use, states, led_chi2(problem, estimate))
+    return _Pass(pictured, use, states, led_chi2(problem, estimate))
 
 
-def _pictured(
-    leds: SeenLeds,
-    s: Smoothed,
-    seen_cam_s: FloatArray,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    settings: FusionSettings,
-) -> tuple[SeenLeds, Pictured, BoolArray]:
-    """Return the LEDs at whose instants a smoothed motion is known, their pictures, and which those are."""
+def _placeable(leds: SeenLeds, s: Smoothed, settings: FusionSettings) -> SeenLeds:
+    """Return the LEDs at whose instants a smoothed motion is sure enough to predict pictures from."""
     motion = sample_motion(
-        s.run, s.nodes, s.problem, s.estimate, s.b, output_t_ns=leds.t_ns, seen_cam_s=seen_cam_s,
+        s.run, s.nodes, s.problem, s.estimate, s.b, output_t_ns=leds.t_ns, seen_cam_s=s.run.t_cam_s,
         common=np.zeros((6, 6)), settings=settings, is_smoothed=True,
     )  # fmt: skip
-    beside_ns = leds.beside_ns()
-    R, t_mm = sample_poses(s.run, s.nodes, s.estimate.state, s.b, beside_ns.ravel())
-    R, t_mm = R.reshape(*beside_ns.shape, 3, 3), t_mm.reshape(*beside_ns.shape, 3)
-    all_mm = np.concatenate([motion.t_camera_brick_mm, *t_mm], axis=1)
-    placed = np.asarray(np.isfinite(all_mm).all(axis=1))
-    known = FusedTrack(*(getattr(motion, f.name)[placed] for f in fields(motion)))
+    return leds.take(np.asarray(np.isfinite(motion.t_camera_brick_mm).all(axis=1)))
+
+
+def _sights(
+    leds: SeenLeds, s: Smoothed, ray_model: RayModel, brick_model: BrickModel
+) -> tuple[_Sights, BoolArray]:
+    """Return the LEDs whose instants a smoothed motion covers, with their pictures, and which those are."""
+    t_ns = np.concatenate([leds.t_ns[None], leds.beside_ns()])
+    R, t_mm = sample_poses(s.run, s.nodes, s.estimate.state, s.b, t_ns.ravel())
+    R, t_mm = R.reshape(*t_ns.shape, 3, 3), t_mm.reshape(*t_ns.shape, 3)
+    placed = np.asarray(np.isfinite(t_mm).all(axis=(0, 2)))
     leds = leds.take(placed)
-    return leds, picture(leds, known, (R[:, placed], t_mm[:, placed]), ray_model, brick_model), placed
+    pictured = picture(leds, R[:, placed], t_mm[:, placed], ray_model, brick_model)
+    return _Sights(leds, pictured, still_sightings(leds)), placed
 
 
 def _without_frames(run: Run) -> Run:

@@ -14,6 +14,7 @@ unsure by the same derivatives.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
@@ -101,15 +102,17 @@ class StandingPrior:
         sensor_sd = np.repeat([settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3], [18, 3])
         return cls(sensor_sd, np.stack(shift, axis=1))
 
-    def covariance(self, offset_sd_px: float) -> FloatArray:
-        """Return the covariance of all, shape (q, q), where single LEDs are off by so much."""
+    def covariance(self, offset_sd_px: ArrayLike) -> FloatArray:
+        """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...)."""
         own = OWN_SHARE * self.led_shift_px
         q = _FIRST_LED + own.size
-        out = np.zeros((q, q))
-        np.fill_diagonal(out, np.concatenate([self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(own.size)]))
+        out = np.zeros((*np.shape(offset_sd_px), q, q))
+        at = np.arange(q)
+        out[..., at, at] = np.concatenate([self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(own.size)])
         for led, shift in enumerate(own):
             part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
-            out[part, part] = offset_sd_px**2 * np.eye(2) + np.outer(shift, shift)
+            out[..., part, part] = np.outer(shift, shift)
+        out[..., at[_FIRST_LED:], at[_FIRST_LED:]] += np.square(offset_sd_px)[..., None]
         return out
 
 
@@ -158,11 +161,13 @@ class StandingWay:
         """
         dy, y = self._dy.reshape(-1, self._dy.shape[2]), self._y.ravel()
         normal, pull = dy.T @ dy, dy.T @ y
-        belief = np.array([_fit(prior.covariance(sd), known, normal, pull)[0] for sd in _OFFSET_SDS_PX])
+        belief = _likeliest(prior.covariance(_OFFSET_SDS_PX), known, normal, pull)[0]
         weight = np.exp(belief - belief.max())
         offset_sd_px = float(np.sqrt((weight * _OFFSET_SDS_PX**2).sum() / weight.sum()))
-        _, change, covariance = _fit(prior.covariance(offset_sd_px), known, normal, pull)
-        return StandingErrors(known + change, covariance, offset_sd_px)
+        believed = prior.covariance(offset_sd_px)
+        _, value = _likeliest(believed, known, normal, pull)
+        covariance = np.linalg.solve(np.eye(len(known)) + believed @ normal, believed)
+        return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px)
 
     def with_doubt(self, estimate: Estimate, errors: StandingErrors) -> Estimate:
         """Return smoothed states with what the errors leave unsure in their covariance."""
@@ -194,22 +199,18 @@ def _own_part(problem: Problem, leds: SeenLeds, pictured: Pictured, n_leds: int)
     return own
 
 
-def _fit(
+def _likeliest(
     prior: FloatArray, known: FloatArray, normal: FloatArray, pull: FloatArray
-) -> tuple[float, FloatArray, FloatArray]:
-    """Return log-likelihood, change and covariance of errors with this prior about zero.
+) -> tuple[FloatArray, FloatArray]:
+    """Return log-likelihoods, shape (...), and the likeliest errors, shape (..., q), of priors (..., q, q).
 
-    ``known`` was taken out already. Errors with no variance stay as they are.
+    With prior P about zero and normal matrix N these are (1 + P N)^-1 P b: nothing is asked of P's inverse,
+    and an error without variance is none. ``known`` was taken out already; where there is no variance, it
+    was so before, and stays.
     """
-    free = np.diagonal(prior) > 0
-    P, N = prior[np.ix_(free, free)], normal[np.ix_(free, free)]
-    believed = np.linalg.inv(P)
-    held = believed @ known[free]
-    b = pull[free] + held
-    covariance = np.linalg.inv(N + believed)
-    change, whole = np.zeros(len(known)), np.zeros_like(prior)
-    change[free] = -covariance @ b
-    whole[np.ix_(free, free)] = covariance
-    squares = known[free] @ held - b @ covariance @ b
-    log_det = np.linalg.slogdet(P)[1] - np.linalg.slogdet(covariance)[1]
-    return -0.5 * float(squares + log_det), change, whole
+    stays = np.diagonal(prior, axis1=-2, axis2=-1) == 0
+    b = (normal @ np.where(stays, 0.0, known)[..., None])[..., 0] - pull
+    whole = np.eye(len(known)) + prior @ normal
+    value = np.linalg.solve(whole, prior @ b[..., None])[..., 0]
+    belief = 0.5 * ((b * value).sum(axis=-1) - np.linalg.slogdet(whole)[1])
+    return belief, np.where(stays, known, value)
