@@ -9,7 +9,7 @@ import importlib.metadata
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,12 +20,11 @@ import pyarrow.parquet
 from bricktrack_common.arrays import IntArray
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import RunFormatError
-from bricktrack_common.poses import Pose
 from bricktrack_common.run_manifest import MANIFEST_NAME, RunManifest
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_host.durable_files import kept_beside, write_folder_whole
 from bricktrack_host.results.daq_clock import EdgeFit, fit_edges
-from bricktrack_host.results.ray_errors import RayErrors
+from bricktrack_host.results.rest_entry import RestEntry, rest_entry, rest_pose_of
 from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.results.result_tables import (
     CONVENTIONS,
@@ -125,24 +124,6 @@ class RunResult:
         return self.manifest.trigger.t0_ns
 
 
-class _RayErrorsEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    rotation_camera_brick: list[list[float]]
-    position_camera_mm: list[float]
-    factor: list[list[float]]
-    slopes: list[list[list[float]]]
-
-
-class _RestEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    rotation_camera_rest: list[list[float]]
-    position_camera_mm: list[float]
-    interval_ns: tuple[int, int]
-    n_frames: int
-    spread_mm: list[float]
-    spread_rad: list[float]
-    source: Literal["found", "given"]
-    ray_errors: _RayErrorsEntry | None = None
-
-
 class _Summary(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     schema: str = RESULTS_SCHEMA
     version: int = RESULTS_VERSION
@@ -153,7 +134,7 @@ class _Summary(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     led_names: list[str]
     conventions: dict[str, str]
     tables: dict[str, int]
-    rest_pose: _RestEntry | None
+    rest_pose: RestEntry | None
     square_wave: Details | None
     alignment: Details
     calibration: Details
@@ -269,7 +250,7 @@ def _write_files(result: RunResult, folder: Path) -> None:
         led_names=list(result.led_names),
         conventions=CONVENTIONS,
         tables={name: table.num_rows for name, table in tables.items()},
-        rest_pose=_rest_entry(result.rest),
+        rest_pose=rest_entry(result.rest),
         square_wave=_square_wave(result.edge_fit),
         alignment=result.alignment,
         calibration=result.calibration,
@@ -333,7 +314,7 @@ def read_result(folder: Path) -> RunResult:
         edge_index=edge_index,
         edge_fit=edge_fit,
         imu=imu,
-        rest=_rest_pose(summary.rest_pose),
+        rest=rest_pose_of(summary.rest_pose),
         alignment=summary.alignment,
         calibration=summary.calibration,
         problems=tuple(summary.problems),
@@ -384,54 +365,10 @@ def _table_metadata(result: RunResult) -> dict[str, str]:
         "bricktrack.unit": result.manifest.unit,
         "bricktrack.simulated": "true" if result.manifest.simulated else "false",
         "bricktrack.trigger_ns": "none" if result.t0_ns is None else str(result.t0_ns),
-        "bricktrack.rest_pose": msgspec.json.encode(_rest_entry(rest)).decode(),
+        "bricktrack.rest_pose": msgspec.json.encode(rest_entry(rest)).decode(),
         "bricktrack.provenance": msgspec.json.encode(result.provenance).decode(),
     }
     return metadata
-
-
-def _rest_entry(rest: RestPose | None) -> _RestEntry | None:
-    if rest is None:
-        return None
-    return _RestEntry(
-        rotation_camera_rest=rest.R_camera_rest.tolist(),
-        position_camera_mm=rest.t_camera_rest_mm.tolist(),
-        interval_ns=rest.interval_ns,
-        n_frames=rest.n_frames,
-        spread_mm=rest.spread_mm.tolist(),
-        spread_rad=rest.spread_rad.tolist(),
-        source=rest.source,
-        ray_errors=None if rest.ray_errors is None else _ray_errors_entry(rest.ray_errors),
-    )
-
-
-def _ray_errors_entry(errors: RayErrors) -> _RayErrorsEntry:
-    return _RayErrorsEntry(
-        rotation_camera_brick=errors.about.R.tolist(),
-        position_camera_mm=errors.about.t_mm.tolist(),
-        factor=errors.factor.tolist(),
-        slopes=errors.slopes.tolist(),
-    )
-
-
-def _rest_pose(entry: _RestEntry | None) -> RestPose | None:
-    if entry is None:
-        return None
-    return RestPose(
-        R_camera_rest=np.array(entry.rotation_camera_rest),
-        t_camera_rest_mm=np.array(entry.position_camera_mm),
-        interval_ns=entry.interval_ns,
-        n_frames=entry.n_frames,
-        spread_mm=np.array(entry.spread_mm),
-        spread_rad=np.array(entry.spread_rad),
-        source=entry.source,
-        ray_errors=None if entry.ray_errors is None else _ray_errors(entry.ray_errors),
-    )
-
-
-def _ray_errors(entry: _RayErrorsEntry) -> RayErrors:
-    about = Pose(np.array(entry.rotation_camera_brick), np.array(entry.position_camera_mm))
-    return RayErrors(about, np.array(entry.factor), np.array(entry.slopes))
 
 
 def _square_wave(fit: EdgeFit | None) -> Details | None:
