@@ -5,11 +5,11 @@ were all there and decoded without an error, and so did every picture back to it
 """
 
 import logging
-import mmap
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 import av
 import numpy as np
@@ -72,7 +72,7 @@ def decode_run_video(video: Path, frames: FrameTimes, *, threads: int = 2) -> It
 
     Packets are cut from the file by the byte offsets of ``frames`` and carry their index through the decoder,
     so a picture is paired with its record by value and never by counting. Only the decoder's own pictures
-    are held in memory; the file is mapped, not read.
+    are held in memory; of the file no more than a packet.
 
     A decoder does not notice all damage: of 20 random bytes put at random into small pictures, a fifth
     decoded without an error. Compare the file's SHA-256 first (`read_run` with ``verify_hashes``).
@@ -95,14 +95,10 @@ def decode_run_video(video: Path, frames: FrameTimes, *, threads: int = 2) -> It
     if frames.n_frames == 0:
         return
     try:
-        with video.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            yield from _Decoding(video, frames, threads).run(data)
+        with video.open("rb") as file:
+            yield from _Decoding(video, frames, threads).run(file)
     except OSError as e:
         raise VideoError(f"{video}: {e.strerror or e}") from e
-    except ValueError as e:
-        if isinstance(e, VideoError) or video.stat().st_size:
-            raise
-        raise VideoError(f"{video}: the file is empty") from e
 
 
 class _Decoding:
@@ -120,15 +116,18 @@ class _Decoding:
         self._size: tuple[int, int] | None = None
         self._codec = _open_decoder(threads)
 
-    def run(self, data: mmap.mmap) -> Iterator[DecodedFrame]:
-        size = len(data)
+    def run(self, file: BinaryIO) -> Iterator[DecodedFrame]:
+        if os.fstat(file.fileno()).st_size == 0:
+            raise VideoError(f"{self._video}: the file is empty")
         for i, (offset, n_bytes) in enumerate(
             zip(self._frames.byte_offset.tolist(), self._frames.n_bytes.tolist(), strict=True)
         ):
-            if offset + n_bytes > size:
+            file.seek(offset)
+            unit = file.read(n_bytes)
+            if len(unit) < n_bytes:
+                size = os.fstat(file.fileno()).st_size
                 self._cut[i] = f"the video file ends at byte {size}, before this frame does"
                 continue
-            unit = data[offset : offset + n_bytes]  # one packet's copy, which the decoder then owns
             follows, is_restart = self._order.check(unit)
             if follows == "gap":
                 self._gaps.add(i)

@@ -1,5 +1,8 @@
 """Every picture stands with its own record, whatever happens to its neighbours."""
 
+import io
+import os
+
 import av
 import numpy as np
 import pytest
@@ -118,6 +121,19 @@ def test_a_video_cut_in_the_middle_of_a_picture_ends_there(video):
     lost = check(path, frames)
     assert list(lost) == list(range(20, N))
     assert lost[20] == f"the video file ends at byte {cut}, before this frame does"
+
+
+def test_a_file_that_is_cut_while_it_is_read_loses_its_end_and_not_the_process(video):
+    """Of a mapped file, the pages that are gone would end the process."""
+    path, frames = video
+    assert frames.byte_offset[19] > 2 * io.DEFAULT_BUFFER_SIZE  # else it is read before it is cut
+    decoding = decode_run_video(path, frames)
+    assert next(decoding).picture is not None
+    cut = int(frames.byte_offset[20] - 1)
+    os.truncate(path, cut)
+    lost = {f.index: f.lost_because for f in decoding if f.picture is None}
+    assert min(lost) == 19
+    assert lost[19] == f"the video file ends at byte {cut}, before this frame does"
 
 
 def test_a_picture_that_never_was_written_loses_what_is_predicted_from_it(video):
