@@ -3,12 +3,11 @@
 import contextlib
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 from fake_unit import FakeUnit
-from page_commands import typed_on
+from page_commands import type_all
 from path_traced import SAMPLE, import_motion
 from run_folders import make_run
 from small_lab import BRICK, FLEET, UNITS, invented_run
@@ -21,29 +20,6 @@ from bricktrack_host.cli.main import app
 from bricktrack_host.results.result_store import read_result, write_results
 
 RUN = "9f31c2_0007_shake"
-
-
-def type_all(page, *, but=()):
-    """Run a page's commands in order, and return what each printed.
-
-    ``but`` names those that are left out, by a word of theirs or whole.
-    """
-    typed = {" ".join(words): words for words in typed_on(f"docs/how-to/{page}")}
-    unknown = set(but) - {word for line, words in typed.items() for word in (line, *words)}
-    assert not unknown, f"{page} does not say {unknown} any more"
-    printed = {}
-    for line, words in typed.items():
-        if not set(but) & {line, *words}:
-            arguments = [name for word in words[1:] for name in expanded(word)]
-            done = CliRunner().invoke(app, arguments, env={"COLUMNS": "160", "NO_COLOR": "1"})
-            assert done.exit_code == 0, f"{page}: {line}\n{done.output}\n{done.exception}"
-            printed[line] = done.output
-    return printed
-
-
-def expanded(word):
-    """Return what a shell makes of a word: the files of a pattern, where there are any."""
-    return ("*" in word and sorted(str(path) for path in Path().glob(word))) or [word]
 
 
 @pytest.fixture(scope="module")

@@ -66,6 +66,7 @@ class FakeUnit:
         self.last_error = ""
         self.health: list[HealthItem] = []
         self.picture = b""
+        self.camera_mode = "full"
         self.settings: dict[str, object] = {"camera.exposure_us": 2000, "recording.label": ""}
         self.changed: set[str] = set()
         self._context = zmq.Context()
@@ -149,7 +150,7 @@ class FakeUnit:
             case TakeStill():
                 head = StillImage(
                     encoding="png", width_px=0, height_px=0, n_bytes=len(self.picture), model="fake",
-                    crc32=crc32(self.picture), mode="full", exposure_us=2000, analogue_gain=1.0,
+                    crc32=crc32(self.picture), mode=self.camera_mode, exposure_us=2000, analogue_gain=1.0,
                     colour_gains=(1.0, 1.0), lit=None, taken_ns=1, simulated=True,
                 )  # fmt: skip
                 return head, [self.picture]

@@ -1,9 +1,15 @@
-"""The commands that pages of the documentation tell to type."""
+"""The commands that pages of the documentation tell to type, and a hand that types them."""
 
 import re
 import shlex
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+from typer.testing import CliRunner
+
+from bricktrack_device.cli import app as device_app
+from bricktrack_host.cli.main import app as host_app
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -53,3 +59,48 @@ def words_of(text: str) -> list[str]:
 def typed_on(page: str) -> list[list[str]]:
     """Return the words of every whole command on a page, given by its path from the repository's root."""
     return [words_of(c.text) for c in commands_on(page, (ROOT / page).read_text()) if c.whole]
+
+
+def type_all(
+    page: str,
+    *,
+    but: Collection[str] = (),
+    instead: Mapping[str, str] | None = None,
+    before: Mapping[str, Callable[[], object]] | None = None,
+) -> dict[str, str]:
+    """Run a how-to page's commands in order, in the working folder, and return what each printed.
+
+    Parameters
+    ----------
+    page : str
+        Its name.
+    but : collection of str
+        Commands that are left out, by a word of theirs or whole.
+    instead : mapping of str to str
+        Words of the page that are others here.
+    before : mapping of str to callable
+        What is done before a command that has this word.
+    """
+    typed = {" ".join(words): words for words in typed_on(f"docs/how-to/{page}")}
+    said = {word for line, words in typed.items() for word in (line, *words)}
+    unknown = {*but, *(instead or {}), *(before or {})} - said
+    assert not unknown, f"{page} does not say {unknown} any more"
+    printed = {}
+    for line, words in typed.items():
+        if {line, *words} & set(but):
+            continue
+        for word, do in (before or {}).items():
+            if word in words:
+                do()
+        named = [(instead or {}).get(word, word) for word in words]
+        app = {"bricktrack": host_app, "bricktrackd": device_app}[named[0]]
+        arguments = [name for word in named[1:] for name in _expanded(word)]
+        done = CliRunner().invoke(app, arguments, env={"COLUMNS": "160", "NO_COLOR": "1"})
+        assert done.exit_code == 0, f"{page}: {line}\n{done.output}\n{done.exception}"
+        printed[line] = done.output
+    return printed
+
+
+def _expanded(word: str) -> list[str]:
+    """Return what a shell makes of a word: the files of a pattern, where there are any."""
+    return ("*" in word and sorted(str(path) for path in Path().glob(word))) or [word]

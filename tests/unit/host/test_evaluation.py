@@ -2,7 +2,9 @@ import json
 
 import numpy as np
 import pytest
+from page_commands import type_all
 from scipy.spatial.transform import Rotation
+from small_lab import invented_run
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import ConfigError
@@ -164,6 +166,16 @@ def test_the_command_prints_json_and_writes_its_page(tmp_path, monkeypatch):
     page = (tmp_path / "out" / "evaluation.html").read_text(encoding="utf-8")
     assert "Simulated sweeps" in page and "0.2296" in page
     assert (tmp_path / "out" / "evaluation_1.png").stat().st_size > 20_000
+
+
+def test_the_how_to_pages_command_evaluates_a_recording(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    invented_run(tmp_path / "runs" / "b2_9f31c2_0007_sweep", "b2")
+    rests = "0.1,0.4,0,0,0\n0.5,0.9,0,0,0\n"  # the invented brick rests in its first second
+    (tmp_path / "stage.csv").write_text("start_s,end_s,x_mm,y_mm,z_mm\n" + rests)
+    [said] = type_all("evaluate.md", but=("bricktrack evaluate",)).values()  # simulated: the test above
+    assert "stage" in said
+    assert (tmp_path / "evaluation" / "evaluation.html").stat().st_size > 10_000
 
 
 def test_a_run_without_positions_is_refused(tmp_path):
