@@ -11,8 +11,9 @@ Simulated runs of a unit (`tests/support/daemon_runs.py`): chip registers, centr
 In the second table the dropouts leave two LEDs of seven: too few for a pose.
 
 The third table says whether the motion is as sure as it claims: squared errors over the covariance, by their
-degrees of freedom (NEES/6, 1 when honest), and in how many runs the mean lies in its 95 % band. These runs hold
-errors that stand still too, drawn as widely as is stated of them: LED profile, picture size, single LEDs.
+degrees of freedom (NEES/6, 1 when honest), and in how many runs the mean lies in its 95 % band, which is as wide
+as the smoother's own model has it for so few independent errors (`fusion.believed_errors`). These runs hold errors
+that stand still too, drawn as widely as is stated of them: LED profile, picture size, single LEDs.
 
 Run: ``python scripts/bench_tight.py --seeds 6``, and ``--honest 20`` for the third table alone
 """
@@ -27,16 +28,23 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from scipy.stats import t as student_t
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from daemon_runs import DaemonRun, simulate_run
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.fusion.estimate import fuse
-from bricktrack_host.fusion.tight import fuse_tight
+from bricktrack_host.fusion.believed_errors import (
+    MeanBand,
+    draw_pose_errors,
+    normalised_squares,
+    pose_errors,
+)
+from bricktrack_host.fusion.estimate import FusionInput, fuse
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.pose_by_pose.fused_output import common_part
+from bricktrack_host.fusion.smoothing.smoother_kernel import CHI2_6_95
+from bricktrack_host.fusion.tight import fuse_tight, smooth_both, tight_result
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracking.optical_track import solve_poses
 from bricktrack_host.tracking.pose.frame_motion import led_motion
@@ -47,7 +55,7 @@ SEEN = ("m1", "m5")
 LEDS = ("m0", "m1", "m2", "m3", "m4", "m5", "m6")
 STEP_NS = 5_000_000
 STANDING_PX = 0.01
-CHI2_95 = 12.59  # of 6 degrees of freedom
+N_DRAWS = 400  # of a run's errors, for the ends of its band
 Errors = dict[str, tuple[FloatArray, FloatArray]]
 
 
@@ -102,23 +110,15 @@ def errors_of(run: DaemonRun) -> tuple[Errors, BoolArray, BoolArray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Honesty:
-    """Normalised errors, squared (6 degrees of freedom), of one run and method; shape (k,)."""
+    """Normalised errors, squared (6 degrees of freedom), of one run and method; shape (k,).
 
-    since_s: FloatArray
+    ``band``: where their mean may lie when they are as believed.
+    """
+
     squares: FloatArray
+    band: MeanBand
     is_impact: BoolArray
     is_dropout: BoolArray
-
-    @property
-    def is_within_band(self) -> bool:
-        """Whether the mean is 6 within its 95 % band: stretches of half a second count as independent.
-
-        Their scatter gives the band (Student's t). To claim too little fails as well as to claim too much.
-        """
-        stretch = ((self.since_s - self.since_s[0]) // 0.5).astype(np.int64)
-        means = np.bincount(stretch, self.squares) / np.bincount(stretch)
-        reach = student_t.ppf(0.975, means.size - 1) * means.std(ddof=1) / np.sqrt(means.size)
-        return bool(abs(means.mean() - 6.0) <= reach)
 
 
 def honesty_of(seed: int) -> dict[str, Honesty]:
@@ -127,22 +127,25 @@ def honesty_of(seed: int) -> dict[str, Honesty]:
         seed, duration_s=8.0, amplitude_mm=8.0, amplitude_deg=3.0, impact_mps=0.25, stamp_offset_ns=3_300_000,
         dropouts=DROPOUTS, standing_px=STANDING_PX,
     )  # fmt: skip
-    optical = solve_poses(run.observations, run.camera, run.brick)
+    optical, settings = solve_poses(run.observations, run.camera, run.brick), FusionSettings()
     t_ns = np.arange(optical.t_ns[5], optical.t_ns[-5], STEP_NS)
-    R, t_mm = run.truth(t_ns)
-    tight = fuse_tight(
-        run.observations, optical, run.imu, run.camera, run.brick,
-        lever_arm_mm=run.lever_arm_mm, output_t_ns=t_ns,
-    )  # fmt: skip
+    item = FusionInput(optical, run.imu, run.lever_arm_mm, t_ns)
+    first, done = smooth_both(run.observations, item, run.camera, run.brick, settings)
+    tight = tight_result(run.observations, item, first, done, settings)
     since = run.world.since_first_edge_s(t_ns)
     is_dropout = np.any([(since > a) & (since < a + d) for a, d in DROPOUTS], axis=0)
     is_impact = (tight.fused.track.flags & int(PoseFlag.IMPACT)) != 0
+    common = common_part(first.run.cov_seen, first.scale, settings.optical_common_share)
     out = {}
-    for name, found in (("poses", tight.pose_level.track), ("LED by LED", tight.fused.track)):
-        turn = rvec_from_matrix(np.swapaxes(found.R_camera_brick, 1, 2) @ R)
-        error = np.concatenate([turn, t_mm - found.t_camera_brick_mm], axis=1)
-        squares = (error * np.linalg.solve(found.covariance, error[..., None])[..., 0]).sum(axis=1)
-        out[name] = Honesty(since, squares, is_impact, is_dropout)
+    for name, found, states, shared in (
+        ("poses", tight.pose_level.track, first, common),
+        ("LED by LED", tight.fused.track, done.states, np.zeros((6, 6))),
+    ):
+        drawn = draw_pose_errors(
+            states, t_ns, common=shared, n_draws=N_DRAWS, rng=np.random.default_rng(seed)
+        )
+        squares = normalised_squares(pose_errors(found, *run.truth(t_ns)), found.covariance)
+        out[name] = Honesty(squares, MeanBand.of(normalised_squares(*drawn)), is_impact, is_dropout)
     return out
 
 
@@ -150,7 +153,15 @@ def print_honesty(console: Console, runs: list[dict[str, Honesty]]) -> None:
     """Print a row for each method: NEES/6 by kind of instant, and how many instants and runs are in their bands."""
     table = Table(title=f"Are {len(runs)} runs as sure as they claim? NEES/6 (simulated)")
     table.add_column("method")
-    for column in ("quiet", "at impacts", "in dropouts", "all", "instants in 95 %", "runs in their band"):
+    for column in (
+        "quiet",
+        "at impacts",
+        "in dropouts",
+        "all",
+        "instants in 95 %",
+        "runs in their band",
+        "independent",
+    ):
         table.add_column(column, justify="right")
     for name in runs[0]:
         of = [run[name] for run in runs]
@@ -161,8 +172,9 @@ def print_honesty(console: Console, runs: list[dict[str, Honesty]]) -> None:
         parts = (~impact & ~dropout, impact & ~dropout, dropout, np.ones(len(squares), dtype=np.bool_))
         table.add_row(
             name, *(f"{squares[part].mean() / 6:.2f}" for part in parts),
-            f"{100 * (squares < CHI2_95).mean():.0f} %",
-            f"{sum(h.is_within_band for h in of)} of {len(of)}",
+            f"{100 * (squares < CHI2_6_95).mean():.0f} %",
+            f"{sum(h.band.holds(h.squares) for h in of)} of {len(of)}",
+            f"{np.median([h.band.n_independent for h in of]):.0f}",
         )  # fmt: skip
     console.print(table)
 

@@ -21,9 +21,9 @@ from bricktrack_host.fusion.estimate import FusionInput, FusionResult, fused_res
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_by_led.led_smoothing import smooth_leds
+from bricktrack_host.fusion.led_by_led.led_smoothing import SmoothedLeds, smooth_leds
 from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion
-from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
+from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, smooth_poses
 from bricktrack_host.tracks import ImuTrack, LedObservations, OpticalTrack
 
 logger = logging.getLogger(__name__)
@@ -95,17 +95,38 @@ def fuse_tight(
     """
     settings = settings or FusionSettings()
     item = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment)
+    first, done = smooth_both(observations, item, ray_model, brick_model, settings)
+    return tight_result(observations, item, first, done, settings)
+
+
+def smooth_both(
+    observations: LedObservations,
+    item: FusionInput,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    settings: FusionSettings,
+) -> tuple[Smoothed, SmoothedLeds]:
+    """Return the states of the pose-level smoother, and those of the tightly coupled one from there."""
     first = smooth_poses([prepare_run(item, settings)], settings)[0]
+    lever_arm_m = np.asarray(item.lever_arm_mm, dtype=np.float64) * 1e-3
+    leds = SeenLeds.of(observations, ray_model)
+    return first, smooth_leds(leds, first, ray_model, brick_model, lever_arm_m=lever_arm_m, settings=settings)
+
+
+def tight_result(
+    observations: LedObservations,
+    item: FusionInput,
+    first: Smoothed,
+    done: SmoothedLeds,
+    settings: FusionSettings,
+) -> TightResult:
+    """Return what is given out of the states that `smooth_both` returns."""
     pose_level = fused_result(item, first, settings)
-    done = smooth_leds(
-        SeenLeds.of(observations, ray_model), first, ray_model, brick_model,
-        lever_arm_m=np.asarray(lever_arm_mm, dtype=np.float64) * 1e-3, settings=settings,
-    )  # fmt: skip
     leds, smoothed, use, scale = done.leds, done.states, done.use, float(done.noise_scales[0])
-    seen_ns = np.unique(optical.t_ns[leds.frame[use]])
+    seen_ns = np.unique(item.optical.t_ns[leds.frame[use]])
     track = sample_motion(
         smoothed.run, smoothed.nodes, smoothed.problem, smoothed.estimate, 0,
-        output_t_ns=output_t_ns, seen_cam_s=seconds_since(seen_ns, smoothed.run.signal.epoch_ns),
+        output_t_ns=item.output_t_ns, seen_cam_s=seconds_since(seen_ns, smoothed.run.signal.epoch_ns),
         common=np.zeros((6, 6)), settings=settings, is_smoothed=True,
     )  # fmt: skip
     shape = observations.uv_px.shape[:2]
