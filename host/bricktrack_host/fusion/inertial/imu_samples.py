@@ -69,6 +69,11 @@ def roughness(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(steady), np.asarray(maximum_filter1d(impact, 3, mode="nearest"))
 
 
+def is_vibrating(acc_mps2: FloatArray) -> bool:
+    """Return whether specific force, shape (n, 3), holds a steady vibration: most of it is rough."""
+    return bool(np.median(roughness(acc_mps2)[0]) > _VIBRATION_MPS2)
+
+
 def _off_neighbours(values: FloatArray, n_side: int) -> FloatArray:
     """Return the distance of samples from the polynomial through ``n_side`` neighbours on each side."""
     off = np.abs(np.diff(values, 2 * n_side, axis=0)) / comb(2 * n_side, n_side)
@@ -177,8 +182,10 @@ def _without(gain: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(gain, values.T).T, dtype=np.float64)
 
 
-def clean_samples(imu: ImuTrack) -> CleanSamples:
+def clean_samples(imu: ImuTrack, *, mend: bool = True) -> CleanSamples:
     """Return what of a track can be used; without samples that are NaN, gaps or repeats.
+
+    ``mend``: whether samples that break a steady vibration are filled.
 
     Raises
     ------
@@ -204,8 +211,7 @@ def clean_samples(imu: ImuTrack) -> CleanSamples:
     clip_limit = imu.acc_range_mps2 if imu.acc_range_mps2 > 0 else np.inf
     acc, clip_sd = _bridge_clipped(t_s, imu.acc_mps2[use], clip_limit)
     gyro, filled_sd = imu.gyro_radps[use], np.zeros(len(t_s))
-    shaking = roughness(acc)[0]
-    if np.median(shaking) > _VIBRATION_MPS2:
-        mended = mend_vibration(gyro, acc, shaking)
+    if mend and is_vibrating(acc):
+        mended = mend_vibration(gyro, acc, roughness(acc)[0])
         gyro, acc, filled_sd = mended.gyro_radps, mended.acc_mps2, mended.acc_sd_mps2
     return CleanSamples(epoch_ns, t_s, gyro, acc, clip_sd, filled_sd)

@@ -9,6 +9,7 @@ from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, Ti
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import CleanSamples, clean_samples, seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.fusion.pose_by_pose.folded_vibration import samples_beside_camera
 from bricktrack_host.fusion.pose_by_pose.gap_fill import fill_of_gaps
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import (
     NoiseLevel,
@@ -88,9 +89,11 @@ class Run:
         camera: CameraMotion | None = None,
     ) -> "Run":
         """Return what of a run is used: frames with a pose, and the time to be covered."""
-        samples = clean_samples(imu)
         if camera is None:
+            samples = samples_beside_camera(optical, imu, alignment, lever_arm_mm * 1e-3)
             samples = replace(samples, fill=fill_of_gaps(optical, samples, alignment, lever_arm_mm * 1e-3))
+        else:
+            samples = clean_samples(imu)
         signal = ImuSignal.from_samples(samples, gyro_filter_s=alignment.gyro_filter_s)
         if camera is not None:
             optical = still_track(optical, camera, imu_seconds(alignment, optical.t_ns, signal.epoch_ns))
