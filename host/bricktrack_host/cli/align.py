@@ -1,5 +1,8 @@
 """``bricktrack align``: how the clocks of camera and IMU lie to each other, by the motion that both saw."""
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -83,7 +86,8 @@ def align(
     """Say by how much camera and IMU differ in time, how sure that is, and whether their stamps agree.
 
     Works on processed runs, and on poses and inertial samples from CSV files, which need no common clock.
-    Exits with 1 if the motion tells no offset, or one that the stamps do not allow.
+    Frame stamps that slip by whole periods from some frame on are found, and mended for what is said.
+    Exits with 1 if they do, if the motion tells no offset, or one that the stamps do not allow.
 
     For example:
 
@@ -103,7 +107,7 @@ def align(
     failed = 0
     for run in sources:
         try:
-            with err.status(f"{run or poses}: comparing both motions", spinner="dots"):
+            with err.status(f"{run or poses}: comparing both motions", spinner="dots"), _without_log():
                 report, simulated = _report(
                     run, poses, imu, lever_arm_mm, within, stamps_sd_ms, with_mount=mount
                 )
@@ -119,7 +123,7 @@ def align(
         rows.append({"recording": name, "simulated": simulated, **figures})
         failed += not figures["trusted"] or figures["stamps_agree"] is False
         if not json:
-            _say(name + (" (simulated)" if simulated else ""), report, chip)
+            _say(name + (" (simulated)" if simulated else ""), report, chip, within)
         if plot is not None:
             from bricktrack_host.reporting.alignment_plot import save_alignment_plot
 
@@ -130,6 +134,18 @@ def align(
         print_json({"ok": not failed, "recordings": rows})
     if failed:
         raise typer.Exit(EXIT_ERROR)
+
+
+@contextmanager
+def _without_log() -> Iterator[None]:
+    """Keep to itself what the fusion logs of the clocks: all of that is said below, once and in order."""
+    log = logging.getLogger("bricktrack_host.fusion")
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 def _sources(runs: list[Path], poses: Path | None, imu: Path | None) -> list[Path | None]:
@@ -245,7 +261,7 @@ def _chip_figures(
     }
 
 
-def _say(name: str, report: "AlignmentReport", chip: "dict[str, float | None]") -> None:
+def _say(name: str, report: "AlignmentReport", chip: "dict[str, float | None]", within_s: float) -> None:
     f = report.figures()
     table = Table(title=f"Clocks of {name}", title_justify="left", show_header=False, box=None)
     table.add_column(style="bold")
@@ -256,11 +272,14 @@ def _say(name: str, report: "AlignmentReport", chip: "dict[str, float | None]") 
             return "-"
         return f"{f[value]:.{digits}f} ± {f[sd]:.{digits}f} {unit}"
 
-    table.add_row("IMU time less camera time", with_sd("offset_ms", "offset_sd_ms", "ms", 3))
+    is_told = f["source"] == "motion"
+    offset = with_sd("offset_ms", "offset_sd_ms", "ms", 3) if is_told else "not told by the motion"
+    table.add_row("IMU time less camera time", offset)
     if f["smoothed_offset_ms"] is not None:
         table.add_row("  with positions", with_sd("smoothed_offset_ms", "smoothed_offset_sd_ms", "ms", 3))
         table.add_row("accelerometer less gyro lag", with_sd("acc_lag_ms", "acc_lag_sd_ms", "ms", 2))
-    table.add_row("rate of the two clocks", with_sd("skew_ppm", "skew_sd_ppm", "ppm", 1))
+    if is_told:
+        table.add_row("rate of the two clocks", with_sd("skew_ppm", "skew_sd_ppm", "ppm", 1))
     table.add_row("as the stamps have it", with_sd("stamps_offset_ms", "stamps_offset_sd_ms", "ms", 1))
     if f["sensor_clock_ppm"] is not None:
         table.add_row(
@@ -278,18 +297,20 @@ def _say(name: str, report: "AlignmentReport", chip: "dict[str, float | None]") 
             f"{chip['chip_orientation_off_max_deg']:.2f} at most; its gravity "
             f"{chip['chip_gravity_off_deg']:.2f} deg from that of the run",
         )
-    if f["stamps_agree"] is None:
-        verdict = "the motion tells no offset: the stamps are all there is"
-    elif f["stamps_agree"]:
-        verdict = "motion and stamps agree"
-    else:
-        verdict = "motion and stamps disagree"
-    table.add_row("verdict", verdict)
-    if f["remark"]:
-        table.add_row("", str(f["remark"]))
-    for problem in report.stamps.problems:
-        table.add_row("", problem)
+    table.add_row("verdict", _verdict(report, within_s))
     out.print(table)
+    if report.n_restamped:
+        out.print(f"- {report.n_restamped} frame stamps were mended when the run was processed", markup=False)
+    for problem in [*filter(None, [report.alignment.reason]), *report.problems]:
+        out.print(f"- {problem}", markup=False)
+
+
+def _verdict(report: "AlignmentReport", within_s: float) -> str:
+    if report.slips is not None:
+        return "the frame stamps slip; what stands above is of mended ones"
+    if report.stamps_agree is None:
+        return f"the motion tells no offset within {within_s:g} s (--within); the stamps are all there is"
+    return "motion and stamps agree" if report.stamps_agree else "motion and stamps disagree"
 
 
 def _add_mount(table: Table, mount: "Mount") -> None:

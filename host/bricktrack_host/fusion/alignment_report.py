@@ -10,11 +10,14 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.clocks.frame_stamps import StampCheck, check_stamps
 from bricktrack_host.fusion.clocks.rotation_fit import Correlation, correlate
+from bricktrack_host.fusion.clocks.slip_search import find_slips
+from bricktrack_host.fusion.clocks.stamp_slips import StampSlips
 from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, align_times, has_pose
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.mount import Mount, refine_mount
+from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 
@@ -29,8 +32,12 @@ class AlignmentReport:
     fused : FusionResult or None
         Where the lever arm is known: offset and skew by all that camera and IMU say, and the lag of the
         accelerometer behind the gyro.
+    slips : StampSlips or None
+        Where the frames' stamps slip by whole periods; all else here is of mended ones.
+    n_restamped : int
+        Frames whose stamps had been mended so before, when the run was processed.
     stamps : StampCheck
-        What speaks against the frames' stamps.
+        What else speaks against the frames' stamps.
     prior_offset_ns, prior_sd_ns : float, ns
         What the stamps promise.
     correlation : Correlation
@@ -45,6 +52,8 @@ class AlignmentReport:
 
     alignment: TimeAlignment
     fused: FusionResult | None
+    slips: StampSlips | None
+    n_restamped: int
     stamps: StampCheck
     prior_offset_ns: float
     prior_sd_ns: float
@@ -54,6 +63,18 @@ class AlignmentReport:
     optical_radps: FloatArray
     gyro_radps: FloatArray
 
+    @property
+    def problems(self) -> list[str]:
+        """What speaks against the frames' stamps, in words."""
+        return [*([] if self.slips is None else self.slips.words()), *self.stamps.problems]
+
+    @property
+    def stamps_agree(self) -> bool | None:
+        """Whether motion and stamps agree; None where the motion does not tell."""
+        if self.slips is not None or self.stamps.is_contradicted or self.alignment.disagrees_with_stamps:
+            return False
+        return True if self.alignment.source == "data" else None
+
     def figures(self) -> dict[str, object]:
         """Return the figures by name, with units in the names; None where a figure is not known."""
         a, f = self.alignment, self.fused
@@ -61,10 +82,13 @@ class AlignmentReport:
         found: dict[str, object] = {
             "source": "motion" if a.source == "data" else "stamps",
             "trusted": a.is_trusted,
-            "stamps_agree": not (a.disagrees_with_stamps or self.stamps.is_contradicted)
-            if a.source == "data"
-            else None,
-            "stamps_problems": list(self.stamps.problems),
+            "stamps_agree": self.stamps_agree,
+            "stamps_problems": self.problems,
+            "stamps_slip": [
+                {"frame": s.frame, "first": s.first, "last": s.last, "late_periods": s.late_periods}
+                for s in (() if self.slips is None else self.slips.slips)
+            ],
+            "frames_restamped": self.n_restamped,
             "remark": a.reason,
             "offset_ms": a.offset_ns / 1e6,
             "offset_sd_ms": a.offset_sd_ns / 1e6,
@@ -148,9 +172,22 @@ def report_alignment(
     ShapeError
         If there are too few inertial samples.
     """
-    alignment = align_times(
-        optical, imu, max_offset_s=max_offset_s, prior_offset_ns=prior_offset_ns, prior_sd_ns=prior_sd_ns
-    )
+    n_restamped = int(np.count_nonzero(optical.flags & int(PoseFlag.RESTAMPED)))
+
+    def aligned(poses: OpticalTrack) -> TimeAlignment:
+        return align_times(
+            poses, imu, max_offset_s=max_offset_s, prior_offset_ns=prior_offset_ns, prior_sd_ns=prior_sd_ns
+        )
+
+    alignment = aligned(optical)
+    stamps_ns = optical.t_ns if frame_stamps_ns is None else frame_stamps_ns
+    slips = find_slips(
+        optical, imu, alignment, aligned,
+        prior_offset_ns=prior_offset_ns, prior_sd_ns=prior_sd_ns, max_offset_s=max_offset_s,
+    )  # fmt: skip
+    if slips is not None:
+        stamps_ns = stamps_ns + (slips.t_ns - optical.t_ns)
+        alignment, optical = slips.alignment, slips.mended(optical)
     fused, mount = None, None
     if lever_arm_mm is not None and alignment.source == "data":
         fused = fuse(
@@ -171,9 +208,9 @@ def report_alignment(
     return AlignmentReport(
         alignment=alignment,
         fused=fused,
-        stamps=check_stamps(
-            optical.t_ns if frame_stamps_ns is None else frame_stamps_ns, optical, imu, alignment
-        ),
+        slips=slips,
+        n_restamped=n_restamped,
+        stamps=check_stamps(stamps_ns, optical, imu, alignment),
         prior_offset_ns=prior_offset_ns,
         prior_sd_ns=prior_sd_ns,
         correlation=correlate(t_cam_s, R, signal, centre_s=prior_offset_ns * 1e-9, max_offset_s=max_offset_s),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from brick_shakes import LEVER_ARM_MM, simulate_shake
 from scipy.spatial.transform import Rotation
+from slipped_stamps import slip
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import RunFormatError
@@ -111,6 +112,38 @@ def test_frame_stamps_that_step_are_told(shake):
     assert "frame stamps step by" in found["stamps_problems"][0]
     steady = report_alignment(shake.optical, shake.imu, prior_sd_ns=2e9, max_offset_s=2.0).figures()
     assert steady["stamps_agree"] is True and steady["stamps_problems"] == []
+
+
+def test_frame_stamps_that_slip_are_located_and_the_figures_are_of_mended_ones(shake):
+    report = report_alignment(slip(shake.optical, 70, -1), shake.imu, prior_sd_ns=2e9, max_offset_s=2.0)
+    found = report.figures()
+    assert found["stamps_agree"] is False
+    (one,) = found["stamps_slip"]
+    assert one["late_periods"] == -1 and one["first"] <= 70 <= one["last"]
+    assert found["offset_ms"] == pytest.approx(1e3 * OFFSET_S, abs=0.5)
+    assert "1 period (33.33 ms) too early" in found["stamps_problems"][0]
+    # What a run was mended of before agrees, and is said.
+    again = report_alignment(
+        report.slips.mended(slip(shake.optical, 70, -1)), shake.imu, prior_sd_ns=2e9, max_offset_s=2.0
+    )
+    assert again.stamps_agree is True
+    assert again.figures()["frames_restamped"] == np.count_nonzero(report.slips.is_mended)
+
+
+def test_the_command_says_where_stamps_slip(shake, files, tmp_path):
+    rows = (files / "poses.csv").read_text().splitlines()
+    head, *rows = rows
+    stamps = [int(row.split(",")[0]) for row in rows]
+    # The picture of row 70 is lost, and the stamps close up.
+    kept = [row.split(",", 1)[1] for k, row in enumerate(rows) if k != 70]
+    lines = [f"{t},{row}" for t, row in zip(stamps[:-1], kept, strict=True)]
+    (tmp_path / "poses.csv").write_text("\n".join([head, *lines]) + "\n")
+    result = run("--poses", tmp_path / "poses.csv", "--imu", files / "imu.csv", "--within", 2)
+    assert result.exit_code == 1
+    said = " ".join(result.output.split())
+    assert "the frame stamps slip; what stands above is of mended ones" in said
+    assert "too early; 1 picture lost and not counted" in said
+    assert said.count("- frame stamps slip") == 1
 
 
 def test_what_is_missing_or_contradictory_is_named(files, tmp_path):

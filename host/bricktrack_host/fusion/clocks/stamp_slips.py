@@ -92,38 +92,35 @@ class StampSlips:
         )
 
     def words(self) -> list[str]:
-        """Return what happened and what was done, a line for each slip."""
-        lines = [self._slip_words(slip) for slip in self.slips]
+        """Return what happened, a line for each slip, and what was done."""
         right = (
-            "which stamps were right the clocks of camera and IMU tell"
+            "which ones were right the clocks of camera and IMU tell"
             if self.is_side_told
-            else "which stamps were right nothing tells: those before the first slip were kept"
+            else "which ones were right nothing tells, so those before the first slip were kept"
         )
-        n = int(np.count_nonzero(self.late_periods))
-        stamps = "1 frame stamp" if n == 1 else f"{n} frame stamps"
-        return [*lines, f"{stamps} mended by whole periods before anything was fused; {right}"]
+        n, n_out = int(np.count_nonzero(self.late_periods)), int(np.count_nonzero(self.left_out))
+        stamps = _number(n, "frame stamp")
+        done = f"{stamps} mended by whole periods, as the turns of camera and gyro ask: {right}"
+        out = f"; {_number(n_out, 'frame')} in between left out" if n_out else ""
+        return [*(self._slip_words(slip) for slip in self.slips), done + out]
 
     def _slip_words(self, slip: StampSlip) -> str:
-        n, by_ms = abs(slip.late_periods), abs(slip.late_periods) * self.period_ns / 1e6
-        periods = f"{n} period{'' if n == 1 else 's'} ({by_ms:.2f} ms)"
-        side = "late" if slip.late_periods > 0 else "early"
-        pictures = "picture" if n == 1 else "pictures"
-        cause = (
-            f"{n} {pictures} there twice, or skipped in the stamps alone"
-            if slip.late_periods > 0
-            else f"{n} {pictures} lost and not counted"
+        n = abs(slip.late_periods)
+        by = f"{_number(n, 'period')} ({n * self.period_ns / 1e6:.2f} ms)"
+        place = (
+            f"from frame {slip.frame} on"
+            if slip.first == slip.last
+            else f"from one of the frames {slip.first} to {slip.last} on"
         )
-        near = slice(max(slip.first - 1, 0), slip.last + 1)
-        gone = int(np.count_nonzero(self.left_out[near]))
-        left_out = f"; {gone} frame{'' if gone == 1 else 's'} there left out" if gone else ""
-        if slip.first == slip.last:
-            place = f"from frame {slip.frame} on"
+        if slip.late_periods < 0:
+            side, cause = "early", f"{_number(n, 'picture')} lost and not counted"
         else:
-            place = f"from a frame between {slip.first} and {slip.last} on"
-        return (
-            f"frame stamps slip: {place} they come {periods} too {side}, by the turns that camera and gyro "
-            f"saw: {cause}{left_out}"
-        )
+            side, cause = "late", f"{_number(n, 'picture')} there once more, or skipped by the stamps alone"
+        return f"frame stamps slip: {place} they come {by} too {side}; {cause}"
+
+
+def _number(n: int, name: str) -> str:
+    return f"{n} {name}{'' if n == 1 else 's'}"
 
 
 def mend(
