@@ -28,11 +28,11 @@ from bricktrack_host.fusion.pose_by_pose.moving_camera import (
     NOT_OBSERVABLE,
     CameraAlignment,
     CameraImu,
-    CameraMotion,
     align_both,
     without_gains,
 )
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, smooth_poses
+from bricktrack_host.fusion.sensor_agreement import require_agreement
 from bricktrack_host.fusion.smoothing.smoother import BA, BG, GRAV, LAG, LOSS, SKEW, TAU, Estimate
 from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
@@ -245,25 +245,19 @@ def prepare_run(item: FusionInput, settings: FusionSettings) -> Run:
         alignment, motion = both.brick, both.motion
         is_near = "stamps" not in (both.brick.source, both.camera.source)
     imu = item.imu if alignment.sample_clock is None else alignment.sample_clock.restamp(item.imu)
-    return _run(item, imu, alignment, motion, lever_arm_mm, settings, is_near=is_near)
-
-
-def _run(
-    item: FusionInput,
-    imu: ImuTrack,
-    alignment: TimeAlignment,
-    motion: CameraMotion | None,
-    lever_arm_mm: FloatArray,
-    settings: FusionSettings,
-    *,
-    is_near: bool,
-) -> Run:
-    camera = motion and settle_delay(
+    run = Run.from_tracks(
+        item.optical, imu, alignment,
+        lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns, camera=motion,
+    )  # fmt: skip
+    if motion is None:
+        return run
+    require_agreement(run, settings)
+    settled = settle_delay(
         item.optical, imu, alignment, motion, lever_arm_mm=lever_arm_mm, settings=settings, is_near=is_near
     )
     return Run.from_tracks(
         item.optical, imu, alignment,
-        lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns, camera=camera,
+        lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns, camera=settled,
     )  # fmt: skip
 
 
