@@ -114,7 +114,7 @@ def _motion(entry: AssemblyEntry, histories: dict[str, MotionHistory]) -> tuple[
         f"{entry.name} ({entry.kind})",
         f"Motion from rest, seen from {entry.base}, in the axes of the whole brick: {chains}. "
         "A click on a name hides that component.",
-        MOTION_KEY[2:],
+        MOTION_KEY[2:4],
     )
     return section, panels.grid([made[k] for k in (0, 3, 1, 4, 2, 5)], columns=2)
 

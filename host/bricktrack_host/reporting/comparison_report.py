@@ -122,12 +122,13 @@ def _key_figures(pairs: list[Alike]) -> list[Key]:
 
 def _table_section(pairs: list[Alike]) -> Section:
     section = Section("motions", "Motions, the worst first", [
-        "Of each axis: largest difference / root mean square. Then the largest in standard deviations."
+        "Of each axis: largest difference / root mean square. Then the largest in standard deviations, when "
+        "it was, how much lies beyond the 95 % band, and the instants measured both times, or once only."
     ])  # fmt: skip
     rows = []
     for pair in pairs:
         cells = [
-            "–" if pair.n == 0 else f"{high:.3g}\N{NO-BREAK SPACE}/ {rms:.2g}"
+            "–" if pair.n == 0 else f"{high:.3f}\N{NO-BREAK SPACE}/ {rms:.3f}"
             for high, rms in zip(pair.largest.tolist(), pair.rms.tolist(), strict=True)
         ]
         in_sd = "–" if pair.n == 0 else f"{float(np.nan_to_num(pair.in_sd).max()):.2g}"
@@ -135,7 +136,7 @@ def _table_section(pairs: list[Alike]) -> Section:
         worst = f"{pair.worst_s:.2f}" if np.isfinite(pair.worst_s) else "–"
         came, went = str(pair.appeared), str(pair.disappeared)
         rows.append([pair.name, AT_WORDS[pair.at], *cells, in_sd, worst, beyond, str(pair.n), came, went])
-    head = ["motion", "rows", *AXES, "in sd", "at, s", "beyond", "both", "came", "went"]
+    head = ["motion", "rows", *AXES, "largest, sd", "at, s", "beyond", "both", "came", "went"]
     section.tables.append(SectionTable("", head, rows, 2))
     return section
 

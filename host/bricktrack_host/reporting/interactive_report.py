@@ -64,6 +64,7 @@ MOTION_KEY = (
     ("dot", OPTICAL, "optical, 95 % bars"),
     ("shade", "#d5cfc2", "no optical pose used"),
     ("bar", IMPACT, "impact"),
+    ("dashes", INK, "trigger"),
 )
 
 

@@ -103,12 +103,15 @@ class EdgeFit:
         n_extra = int(np.count_nonzero(self.is_extra))
         if self.missed_index.size:
             share = self.missed_index.size / (self.last_index + 1)
-            words = f"{self.missed_index.size} of {self.last_index + 1} edges of the square wave were missed"
+            n_missed = self.missed_index.size
+            was = "was" if n_missed == 1 else "were"
+            words = f"{n_missed} of {self.last_index + 1} edges of the square wave {was} missed"
             if share > 0.3:
                 words += f"; is its frequency really {self.nominal_hz or 1e9 / self.period_ns:g} Hz?"
             found.append(words)
         if n_extra:
-            found.append(f"{n_extra} edges belong to no sample of the square wave (bounce or interference)")
+            belong = "1 edge belongs" if n_extra == 1 else f"{n_extra} edges belong"
+            found.append(f"{belong} to no sample of the square wave (bounce or interference)")
             if self.is_extra[0]:
                 found.append("the first edge, which started the run, is one: time zero is not a sample")
         if abs(self.rate_ppm) > 300:

@@ -107,7 +107,7 @@ def test_simulated_is_said_and_only_then(nothing, full):
 def test_problems_come_first_in_words(result, full):
     text = parsed(full)[1]
     assert text.index("2 frames were dropped by the camera") < text.index("Peak displacement")
-    assert "1 of 3000 edges of the square wave were missed" in text
+    assert "1 of 3000 edges of the square wave was missed" in text
     good = replace(result, problems=(), edge_fit=None)
     line, problems = verdict(good, key_figures(good))
     assert line == "No problem found: 452 of 462 frames gave a pose (97.8 %)."
