@@ -129,7 +129,7 @@ class RotationFit:
         self._skew_prior_sd = skew_prior_sd
         n = int(np.ceil((signal.t_s[-1] - signal.t_s[0]) / _NODE_S))
         self._nodes = np.linspace(signal.t_s[0], signal.t_s[-1], n + 1)
-        self._pieces = signal.pieces()
+        self._pieces = signal.gyro_pieces()
         self._remove_bias(np.zeros(3))
         self._unbiased = self._attitude  # every solution begins with it
 

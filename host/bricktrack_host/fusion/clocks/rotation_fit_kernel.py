@@ -9,13 +9,13 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.compiled import compiled
 from bricktrack_host.fusion.inertial.rotation_kernel import turn_by, write_rotation_vector
-from bricktrack_host.fusion.inertial.signal_kernel import SignalPieces, held_value, piece_of
+from bricktrack_host.fusion.inertial.signal_kernel import GyroPieces, held_value, piece_of
 
 _RIDGE = 1e-12  # of the largest knot: one without frames is held at zero
 
 
 @compiled
-def integrated_attitudes(pieces: SignalPieces, nodes_s: FloatArray, bias_radps: FloatArray) -> FloatArray:
+def integrated_attitudes(pieces: GyroPieces, nodes_s: FloatArray, bias_radps: FloatArray) -> FloatArray:
     """Return the gyro's attitudes at instants seen from the first, shape (n, 3, 3).
 
     Over 2.5 ms the integral of the rate is the rotation vector: coning is below 1e-8 rad.
@@ -39,7 +39,7 @@ def integrated_attitudes(pieces: SignalPieces, nodes_s: FloatArray, bias_radps: 
 
 @compiled
 def compare_with_gyro(
-    pieces: SignalPieces,
+    pieces: GyroPieces,
     nodes_s: FloatArray,
     node_attitude: FloatArray,
     bias_radps: FloatArray,

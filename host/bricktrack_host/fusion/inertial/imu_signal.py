@@ -4,6 +4,7 @@ Times inside are seconds after `ImuSignal.epoch_ns` on the clock of the samples.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from bricktrack_host.fusion.inertial.imu_samples import (
     fill_instants,
     roughness,
 )
-from bricktrack_host.fusion.inertial.signal_kernel import SignalPieces, integrate_steps
+from bricktrack_host.fusion.inertial.signal_kernel import GyroPieces, SignalPieces, integrate_steps
 from bricktrack_host.tracks import ImuTrack
 
 _GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
@@ -96,15 +97,69 @@ def _spline(
     return CubicSpline(knots, at_knots)
 
 
-def _impacts(t_s: FloatArray, values: FloatArray, spline: CubicSpline[Any], period_s: float) -> FloatArray:
-    """Return the pulses of samples, see `roughness`; across a gap the spline stands for the neighbours."""
-    missing = np.flatnonzero(np.diff(t_s) > _GAP_PERIODS * period_s)
-    if not missing.size:
-        return roughness(values)[1]
-    between = [fill_instants(a, b, period_s) for a, b in zip(t_s[missing], t_s[missing + 1], strict=True)]
-    even_s = np.concatenate([t_s, *between])
-    order = np.argsort(even_s)
-    return np.asarray(roughness(spline(even_s[order]))[1][order < len(t_s)])
+@dataclass(frozen=True, eq=False)
+class SampledVector:
+    """A vector as a continuous signal; what is asked of it is made when first asked for, and kept.
+
+    Attributes
+    ----------
+    t_s, values : ndarray, shape (n,), (n, 3)
+    period_s : float
+    fill : (ndarray, ndarray) or None
+        Instants and values, shape (m,) and (m, 3), that stand for samples missing in long gaps.
+    """
+
+    t_s: FloatArray
+    values: FloatArray
+    period_s: float
+    fill: tuple[FloatArray, FloatArray] | None
+
+    @cached_property
+    def _roughness(self) -> tuple[FloatArray, FloatArray]:
+        return roughness(self.values)
+
+    @property
+    def steady(self) -> FloatArray:
+        """Return what of it is steadily faster than the samples, shape (n,), see `roughness`."""
+        return self._roughness[0]
+
+    @cached_property
+    def impacts(self) -> FloatArray:
+        """Return the pulses, shape (n,), see `roughness`; across a gap the spline stands for neighbours."""
+        t_s = self.t_s
+        missing = np.flatnonzero(np.diff(t_s) > _GAP_PERIODS * self.period_s)
+        if not missing.size:
+            return self._roughness[1]
+        gaps = zip(t_s[missing], t_s[missing + 1], strict=True)
+        even_s = np.concatenate([t_s, *(fill_instants(*gap, self.period_s) for gap in gaps)])
+        order = np.argsort(even_s)
+        return np.asarray(roughness(self.spline(even_s[order]))[1][order < len(t_s)])
+
+    @cached_property
+    def bridge_error(self) -> FloatArray:
+        """Return the error of the cubic where one sample is missing, shape (n,)."""
+        return bridge_error(self.values)
+
+    @cached_property
+    def spline(self) -> CubicSpline[Any]:
+        """Return the signal."""
+        return _spline(self.t_s, self.values, self.period_s, self.fill)
+
+    @cached_property
+    def once(self) -> PPoly[Any]:
+        """Return its integral."""
+        return self.spline.antiderivative()
+
+    @cached_property
+    def twice(self) -> PPoly[Any]:
+        """Return its double integral."""
+        return self.spline.antiderivative(2)
+
+    def sharpened(self, filter_s: float) -> "SampledVector":
+        """Return the vector with the amplitudes that a low-pass took from it, see `sharpened`."""
+        if filter_s <= 0:
+            return self
+        return replace(self, values=sharpened(self.t_s, self.values, filter_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,34 +172,17 @@ class ImuSignal:
         What it was made of.
     period_s : float
         Median sample interval.
-    gyro_radps, acc_mps2 : ndarray, shape (n, 3)
-        Those samples, with the low-passes undone.
-    gyro_roughness_radps, acc_roughness_mps2 : ndarray, shape (n,)
-        The steady part, see `roughness`.
-    gyro_impact_radps, acc_impact_mps2 : ndarray, shape (n,)
-        The pulses, see there.
-    gyro_bridge_radps, acc_bridge_mps2 : ndarray, shape (n,)
-        Error of the cubic where one sample is missing.
     gaps_s : ndarray, shape (n_gaps, 2)
         From the last sample before to the first after each interval with missing samples.
     """
 
     samples: CleanSamples
     period_s: float
-    gyro_radps: FloatArray
-    acc_mps2: FloatArray
-    gyro_roughness_radps: FloatArray
-    acc_roughness_mps2: FloatArray
-    gyro_impact_radps: FloatArray
-    acc_impact_mps2: FloatArray
-    gyro_bridge_radps: FloatArray
-    acc_bridge_mps2: FloatArray
     gaps_s: FloatArray
-    _gyro: CubicSpline[Any]
-    _acc: CubicSpline[Any]
-    _gyro_integral: PPoly[Any]
-    _acc_integral: PPoly[Any]
-    _acc_double: PPoly[Any]
+    _gyro_as_read: SampledVector
+    _acc_as_read: SampledVector
+    _gyro: SampledVector
+    _acc: SampledVector
 
     @classmethod
     def from_track(
@@ -166,54 +204,72 @@ class ImuSignal:
         cls, samples: CleanSamples, *, gyro_filter_s: float = 0.0, acc_filter_s: float = 0.0
     ) -> "ImuSignal":
         """Return the signals of samples that are clean; see `from_track`."""
-        t_s, gyro, acc = samples.t_s, samples.gyro_radps, samples.acc_mps2
+        t_s, fill = samples.t_s, samples.fill
         interval = np.diff(t_s)
         period_s = float(np.median(interval))
-        # Steady roughness before sharpening: what that adds to noise lies high, and is gone once integrated.
-        gyro_steady, acc_steady = roughness(gyro)[0], roughness(acc)[0]
-        if gyro_filter_s > 0:
-            gyro = sharpened(t_s, gyro, gyro_filter_s)
         missing = np.flatnonzero(interval > _GAP_PERIODS * period_s)
-        fill = samples.fill
-        gyro_spline = _spline(t_s, gyro, period_s, None if fill is None else (fill.t_s, fill.gyro_radps))
-        acc_spline = _spline(t_s, acc, period_s, None if fill is None else (fill.t_s, fill.acc_mps2))
-        signal = cls(
+        gyro, acc = (
+            SampledVector(t_s, values, period_s, filled)
+            for values, filled in (
+                (samples.gyro_radps, None if fill is None else (fill.t_s, fill.gyro_radps)),
+                (samples.acc_mps2, None if fill is None else (fill.t_s, fill.acc_mps2)),
+            )
+        )
+        return cls(
             samples=samples,
             period_s=period_s,
-            gyro_radps=gyro,
-            acc_mps2=acc,
-            gyro_roughness_radps=gyro_steady,
-            acc_roughness_mps2=acc_steady,
-            gyro_impact_radps=_impacts(t_s, gyro, gyro_spline, period_s),
-            acc_impact_mps2=np.maximum(_impacts(t_s, acc, acc_spline, period_s), samples.filled_sd_mps2),
-            gyro_bridge_radps=bridge_error(gyro),
-            acc_bridge_mps2=bridge_error(acc),
             gaps_s=np.stack([t_s[missing], t_s[missing + 1]], axis=1),
-            _gyro=gyro_spline,
-            _acc=acc_spline,
-            _gyro_integral=gyro_spline.antiderivative(),
-            _acc_integral=acc_spline.antiderivative(),
-            _acc_double=acc_spline.antiderivative(2),
+            _gyro_as_read=gyro,
+            _acc_as_read=acc,
+            _gyro=gyro.sharpened(gyro_filter_s),
+            _acc=acc.sharpened(acc_filter_s),
         )
-        return signal if acc_filter_s == 0 else signal.with_acc_filter(acc_filter_s)
 
     def with_acc_filter(self, acc_filter_s: float) -> "ImuSignal":
         """Return the signals with this low-pass of the accelerometer undone, in place of any other."""
-        samples = self.samples
-        acc = sharpened(samples.t_s, samples.acc_mps2, acc_filter_s)
-        fill = samples.fill
-        spline = _spline(samples.t_s, acc, self.period_s, None if fill is None else (fill.t_s, fill.acc_mps2))
-        return replace(
-            self,
-            acc_mps2=acc,
-            acc_impact_mps2=np.maximum(
-                _impacts(samples.t_s, acc, spline, self.period_s), samples.filled_sd_mps2
-            ),
-            acc_bridge_mps2=bridge_error(acc),
-            _acc=spline,
-            _acc_integral=spline.antiderivative(),
-            _acc_double=spline.antiderivative(2),
-        )
+        return replace(self, _acc=self._acc_as_read.sharpened(acc_filter_s))
+
+    @property
+    def gyro_radps(self) -> FloatArray:
+        """Return the samples of the angular rate with the low-pass undone, shape (n, 3)."""
+        return self._gyro.values
+
+    @property
+    def acc_mps2(self) -> FloatArray:
+        """Return the samples of the specific force with the low-pass undone, shape (n, 3)."""
+        return self._acc.values
+
+    # Steady roughness before sharpening: what that adds to noise lies high, and is gone once integrated.
+
+    @property
+    def gyro_roughness_radps(self) -> FloatArray:
+        """Return the steady part of what is faster than the samples, shape (n,), see `roughness`."""
+        return self._gyro_as_read.steady
+
+    @property
+    def acc_roughness_mps2(self) -> FloatArray:
+        """Return the same of the specific force."""
+        return self._acc_as_read.steady
+
+    @property
+    def gyro_impact_radps(self) -> FloatArray:
+        """Return the pulses, shape (n,), see `roughness`."""
+        return self._gyro.impacts
+
+    @property
+    def acc_impact_mps2(self) -> FloatArray:
+        """Return the pulses of the specific force, or how unsure samples are that were filled."""
+        return np.maximum(self._acc.impacts, self.samples.filled_sd_mps2)
+
+    @property
+    def gyro_bridge_radps(self) -> FloatArray:
+        """Return the error of the cubic where one sample is missing, shape (n,)."""
+        return self._gyro.bridge_error
+
+    @property
+    def acc_bridge_mps2(self) -> FloatArray:
+        """Return the same of the specific force."""
+        return self._acc.bridge_error
 
     @property
     def epoch_ns(self) -> int:
@@ -235,23 +291,20 @@ class ImuSignal:
 
     def gyro_at(self, t_s: FloatArray) -> FloatArray:
         """Return the measured angular rate, rad/s; held beyond the first and last sample."""
-        return np.asarray(self._gyro(self._held(t_s)))
+        return np.asarray(self._gyro.spline(self._held(t_s)))
 
     def acc_at(self, t_s: FloatArray) -> FloatArray:
         """Return the measured specific force, m/s^2; held beyond the first and last sample."""
-        return np.asarray(self._acc(self._held(t_s)))
-
-    def _integral(self, integral: PPoly[Any], spline: CubicSpline[Any], t_s: FloatArray) -> FloatArray:
-        held = self._held(t_s)
-        return np.asarray(integral(held) + spline(held) * (t_s - held)[..., None])
+        return np.asarray(self._acc.spline(self._held(t_s)))
 
     def gyro_rate_at(self, t_s: FloatArray) -> FloatArray:
         """Return how fast the measured angular rate changes, rad/s^2."""
-        return np.asarray(self._gyro(self._held(t_s), 1))
+        return np.asarray(self._gyro.spline(self._held(t_s), 1))
 
     def angle_at(self, t_s: FloatArray) -> FloatArray:
         """Return the integral of the measured angular rate, component by component, rad."""
-        return self._integral(self._gyro_integral, self._gyro, t_s)
+        held = self._held(t_s)
+        return np.asarray(self._gyro.once(held) + self._gyro.spline(held) * (t_s - held)[..., None])
 
     def in_gap(self, t_s: FloatArray, *, least_periods: float = 0.0) -> BoolArray:
         """Return which instants lie where samples are missing for so long, or beyond the samples."""
@@ -301,17 +354,15 @@ class ImuSignal:
         )  # fmt: skip
         return out
 
+    def gyro_pieces(self) -> GyroPieces:
+        """Return the angular rate's spline and integral for compiled loops."""
+        span_s = (float(self.t_s[0]), float(self.t_s[-1]))
+        return GyroPieces(self._gyro.spline.x, span_s, angle=self._gyro.once.c, gyro=self._gyro.spline.c)
+
     def pieces(self) -> SignalPieces:
         """Return the splines for compiled loops."""
-        return SignalPieces(
-            knots_s=self._gyro.x,
-            span_s=(float(self.t_s[0]), float(self.t_s[-1])),
-            angle=self._gyro_integral.c,
-            gyro=self._gyro.c,
-            acc_twice=self._acc_double.c,
-            acc_once=self._acc_integral.c,
-            acc=self._acc.c,
-        )
+        acc = self._acc
+        return SignalPieces(*self.gyro_pieces(), acc_twice=acc.twice.c, acc_once=acc.once.c, acc=acc.spline.c)
 
 
 @compiled

@@ -12,6 +12,15 @@ _LONGEST_SUBSTEP_S = 2.5e-3  # cubic signal, exact integrals: coning left below 
 _MOST_SUBSTEPS = 4  # a step that is longer than a sample interval has lost its accuracy already
 
 
+class GyroPieces(NamedTuple):
+    """What `SignalPieces` holds of the angular rate."""
+
+    knots_s: FloatArray
+    span_s: tuple[float, float]
+    angle: FloatArray
+    gyro: FloatArray
+
+
 class SignalPieces(NamedTuple):
     """Piecewise polynomials as SciPy keeps them: coefficients, highest power first, of each piece and axis.
 
@@ -60,7 +69,7 @@ def _value(coefficients: FloatArray, i: int, axis: int, s: float) -> float:
 
 @compiled_sums
 def held_value(
-    integral: FloatArray, signal: FloatArray, i: int, axis: int, t_s: float, pieces: SignalPieces
+    integral: FloatArray, signal: FloatArray, i: int, axis: int, t_s: float, pieces: GyroPieces
 ) -> float:
     """Return an integral of a signal that is held constant beyond the samples; ``i`` is the piece there."""
     held = min(max(t_s, pieces.span_s[0]), pieces.span_s[1])
