@@ -1,14 +1,15 @@
 """How long processing a run takes beside FFmpeg's bare decode of its video, on a simulated recording.
 
-The first time, 15 s are recorded with ``bricktrack demo``: the real daemon, simulated sensors, the pull. The
-recording stays under the system's temporary directory for the next time. Then, by turns, the video is decoded
-with as many threads and nothing done with its pictures, and the whole run is processed, from reading it to its
-report: in this process, as one of several runs is, or with ``--command`` by the command in a process of its
-own, which loads Python and all modules. Each processing is compared with the mean of the decodes just before
-and just after it. Ratios say more than times on a machine with other work:
+The first time, 15 s, or ``--seconds``, are recorded with ``bricktrack demo``: the real daemon, simulated
+sensors, the pull. The recording stays under the system's temporary directory for the next time. Then, by turns,
+the video is decoded with as many threads and nothing done with its pictures, and the whole run is processed,
+from reading it to its report: in this process, as one of several runs is, or with ``--command`` by the command
+in a process of its own, which loads Python and all modules. Each processing is compared with the mean of the
+decodes just before and just after it. Ratios say more than times on a machine with other work:
 
     python scripts/bench_process.py
     python scripts/bench_process.py --command
+    python scripts/bench_process.py --seconds 60      # does memory grow with the recording?
     python scripts/bench_process.py --run runs/b2_9f31c2_0007_shake --calibration b2.json --layout brick.toml
 """
 
@@ -28,7 +29,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before NumPy is loaded
 
 from bench_decode import bare_decode
-from recording_to_time import simulated_recording
+from recording_to_time import DURATION_S, simulated_recording
 
 from bricktrack_common.run_folder import Run, read_run
 from bricktrack_host.pipeline import process_run
@@ -97,6 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--seconds", type=int, default=DURATION_S, help="length of the simulated recording")
     parser.add_argument("--run", type=Path, help="another run, with its calibration and layout")
     parser.add_argument("--calibration", type=Path)
     parser.add_argument("--layout", type=Path)
@@ -106,7 +108,7 @@ def main() -> None:
     if options.repeat < 2:
         parser.error(f"--repeat is {options.repeat}; medians and spread need at least 2")
     if options.run is None:
-        folder, calibration, layout = simulated_recording()
+        folder, calibration, layout = simulated_recording(options.seconds)
     elif options.calibration is None or options.layout is None:
         parser.error("--run needs --calibration and --layout")
     else:
