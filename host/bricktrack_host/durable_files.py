@@ -5,11 +5,13 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 from bricktrack_common.errors import BricktrackError, StorageError
 
+_SYNCED_AT_ONCE = 8
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -26,6 +28,12 @@ def sync_file(path: Path) -> None:
     """Make a file's bytes durable."""
     with path.open("rb+") as file:
         os.fsync(file.fileno())
+
+
+def _sync_files(paths: list[Path]) -> None:
+    """Make the bytes of files durable, together: a disk takes little longer over many than over one."""
+    with ThreadPoolExecutor(_SYNCED_AT_ONCE) as disk:
+        list(disk.map(sync_file, paths))  # an error of any is raised
 
 
 def write_durably(path: Path, data: bytes) -> None:
@@ -104,8 +112,7 @@ def write_folder_whole(
             for path in folder.iterdir():
                 if path.is_file() and not (partial / path.name).exists():
                     shutil.copy2(path, partial / path.name)
-        for path in sorted(partial.iterdir()):
-            sync_file(path)
+        _sync_files(sorted(partial.iterdir()))
         sync_folder(partial)
         kept = _next_beside(folder) if is_kept else None
         if folder.exists():

@@ -1,6 +1,8 @@
 """Whether a folder can be written is told before the work, and a part of it is never left."""
 
 import errno
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -37,3 +39,35 @@ def test_a_folder_of_another_or_a_read_only_disk_is_named(tmp_path, monkeypatch)
     monkeypatch.setattr(durable_files.os, "access", lambda path, mode: False)
     with pytest.raises(StorageError, match=rf"{tmp_path}: cannot be written. Name another"):
         require_writable(tmp_path / "results", "Name another")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks Linux which file a handle is of")
+def test_every_file_is_on_the_disk_before_the_folder_takes_its_name(tmp_path, monkeypatch):
+    names = {"summary.json", *(f"{i}.csv" for i in range(20))}
+    synced, fsync = set(), durable_files.os.fsync
+
+    def noted(handle):
+        assert not (tmp_path / "results").exists() or synced >= names
+        synced.add(Path(f"/proc/self/fd/{handle}").readlink().name)
+        fsync(handle)
+
+    monkeypatch.setattr(durable_files.os, "fsync", noted)
+    write_folder_whole(
+        tmp_path / "results", lambda p: [(p / name).write_text(name) for name in names], marker="summary.json"
+    )
+    assert synced >= names
+
+
+def test_a_disk_that_fails_for_one_of_many_files_is_named(tmp_path, monkeypatch):
+    def failing(path):
+        if path.name == "7.csv":
+            raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(durable_files, "sync_file", failing)
+    with pytest.raises(StorageError, match="Input/output error"):
+        write_folder_whole(
+            tmp_path / "results",
+            lambda p: [(p / f"{i}.csv").touch() for i in range(9)],
+            marker="summary.json",
+        )
+    assert not (tmp_path / "results").exists()
