@@ -16,6 +16,7 @@ from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.optical.inertial_hint import InertialHint
 from bricktrack_host.fusion.optical.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.pose_by_pose.fused_output import unsure_times
+from bricktrack_host.fusion.sensor_agreement import doubt_about_camera_sensor
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.results.daq_clock import EdgeFit
 from bricktrack_host.results.ray_errors import RayErrors
@@ -169,6 +170,9 @@ def fuse_run(
             problems.append(
                 f"{n_rejected} optical poses disagree with the IMU and their neighbours and were left out"
             )
+        if inertial is not None and inertial.camera is not None:
+            doubt = doubt_about_camera_sensor(fusion.gyro_noise, fusion.acc_noise)
+            problems.extend([] if doubt is None else [doubt])
     else:
         hint = InertialHint(inertial.imu, inertial.alignment) if inertial and inertial.is_hint else None
         track = smooth_optical(optical, wanted, hint=hint)

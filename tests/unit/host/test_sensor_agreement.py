@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from two_imus import IMU_TO_CAMERA_MM, simulate_two_imus
 
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.fusion.estimate import FusionInput, prepare_run
+from bricktrack_host.fusion.estimate import FusionInput, fuse, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraImu
+from bricktrack_host.fusion.sensor_agreement import doubt_about_camera_sensor
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +33,11 @@ def turned(imu, axis, angle_deg):
     return replace(imu, acc_mps2=imu.acc_mps2 @ R.T, gyro_radps=imu.gyro_radps @ R.T)
 
 
+def along_gravity(imu):
+    down = np.median(imu.acc_mps2, axis=0)
+    return down / np.linalg.norm(down)
+
+
 def across_gravity(imu):
     down = np.median(imu.acc_mps2, axis=0)
     axis = np.cross(down, [1.0, 0.0, 0.0])
@@ -42,6 +48,21 @@ def test_a_sensor_entered_a_quarter_turned_is_refused_with_the_rows_to_check(sha
     # A vector of 1 g turned by 90 degrees lies 1.41 g from where it was: 13.9 m/s^2.
     with pytest.raises(TrackingError, match=r"differ by 1[345]\.. m/s\^2.*`rotation` in \[unit.camera_imu\]"):
         prepared(shaken, turned(shaken.camera, across_gravity(shaken.camera), 90))
+
+
+def test_a_turn_about_gravity_leaves_neither_sensor_believed():
+    shaken = simulate_two_imus(1, rocking_deg=1.0, duration_s=5.0)
+    optical = shaken.shake.optical
+
+    def doubt(camera):
+        result = fuse(
+            optical, shaken.brick, lever_arm_mm=LEVER_ARM_MM, output_t_ns=optical.t_ns, camera="imu",
+            camera_imu=CameraImu(camera, IMU_TO_CAMERA_MM),
+        )  # fmt: skip
+        return doubt_about_camera_sensor(result.gyro_noise, result.acc_noise)
+
+    assert doubt(shaken.camera) is None
+    assert "does not fit" in doubt(turned(shaken.camera, along_gravity(shaken.camera), 90))
 
 
 def test_a_sensor_a_few_degrees_off_is_taken(shaken):
