@@ -35,9 +35,9 @@ def checked(shake, stamps_ns, frames=None, *, is_taken_then=False):
     return check_stamps(stamps_ns, optical, shake.imu, align_times(optical, shake.imu)), optical
 
 
-def stepped(shake, size_ns=STEP_NS):
+def stepped(shake, size_ns=STEP_NS, at=AT):
     stamps = shake.optical.t_ns.copy()
-    stamps[AT:] += size_ns
+    stamps[at:] += size_ns
     return stamps
 
 
@@ -175,6 +175,24 @@ def test_a_rate_that_no_crystal_has_is_told():
     (said,) = check.problems
     assert "run apart by -9" in said or "run apart by -10" in said  # ppm; the fit's sd is 11
     assert check.sd_ns == pytest.approx(7.5e6, rel=0.05)
+
+
+def test_stamps_that_slipped_before_the_brick_turned_make_the_whole_run_unsure():
+    shake = simulate_shake(3, frame_rate_hz=32.0, duration_s=6.0, offset_s=0.005)
+    check, _ = checked(shake, stepped(shake, -PERIOD_NS, at=0))
+    (said,) = check.problems
+    assert "36.3 ms between camera and IMU" in said or "36.2 ms between camera and IMU" in said
+    assert "whole periods of 31.25 ms" in said
+    assert check.is_contradicted
+    assert check.sd_ns == pytest.approx(36.25e6, abs=0.4e6)
+
+
+def test_samples_that_grow_old_by_less_than_one_interval_are_no_contradiction():
+    # A sensor's own clock, 600 ppm slow and read by ours: 5 ms in 8 s, before it beats for the first time.
+    shake = simulate_shake(0, frame_rate_hz=32.0, skew=-6e-4)
+    check, _ = checked(shake, shake.optical.t_ns)
+    assert check.problems == ()
+    assert not check.sd_ns.any()
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 11])

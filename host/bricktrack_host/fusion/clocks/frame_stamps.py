@@ -40,7 +40,14 @@ class OffsetChange:
 
 
 def offset_change(
-    optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, *, split_ns: int, from_ns: int, to_ns: int
+    optical: OpticalTrack,
+    imu: ImuTrack,
+    alignment: TimeAlignment,
+    *,
+    split_ns: int,
+    from_ns: int,
+    to_ns: int,
+    rate_sd: float | None = None,
 ) -> OffsetChange | None:
     """Return by how much the offset of IMU and camera changes at an instant, by the rotations on both sides.
 
@@ -53,6 +60,8 @@ def offset_change(
         Of the whole run.
     split_ns, from_ns, to_ns : int, ns, camera time
         The instant, and what to look at around it.
+    rate_sd : float, optional
+        Of the clocks against each other on either side; else what crystals hold, or a sensor's own clock.
 
     Returns
     -------
@@ -69,8 +78,10 @@ def offset_change(
     )
     seen = has_pose(optical) & (optical.t_ns >= from_ns) & (optical.t_ns <= to_ns)
     is_after = optical.t_ns >= split_ns
-    earlier = _offset(optical, alignment, signal, seen & ~is_after)
-    later = _offset(optical, alignment, signal, seen & is_after)
+    if rate_sd is None:
+        rate_sd = _CLOCK_RATE_SD if clock is None else _FREE_RATE_SD
+    earlier = _offset(optical, alignment, signal, seen & ~is_after, rate_sd)
+    later = _offset(optical, alignment, signal, seen & is_after, rate_sd)
     if earlier is None or later is None:
         return None
     change_s, variance_s2 = 0.0, _FLOOR_S**2
@@ -84,7 +95,7 @@ def offset_change(
 
 
 def _offset(
-    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray
+    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray, rate_sd: float
 ) -> tuple[Fit, float] | None:
     """Return what some frames say of the offset beyond the alignment's, and the middle of their times."""
     if not frames.any():
@@ -97,7 +108,7 @@ def _offset(
         optical.R_camera_brick[frames],
         np.maximum(sd_rad, MIN_ROTATION_SD_RAD),
         signal,
-        skew_prior_sd=_CLOCK_RATE_SD if alignment.sample_clock is None else _FREE_RATE_SD,
+        skew_prior_sd=rate_sd,
     )
     fit = solver.solve(0.0)
     return None if fit is None else (fit, float(0.5 * (t_s[0] + t_s[-1])))
@@ -174,9 +185,7 @@ def check_stamps(
                 "to the second, by the rotations that both saw: the stamps of one of them step or drift. "
                 "Poses are as unsure as the motion in that time"
             )
-        elif alignment.source == "data" and abs(alignment.skew) > _SIGMA * np.hypot(
-            alignment.skew_sd, _CLOCK_RATE_SD
-        ):
+        elif _runs_apart(optical, imu, alignment):
             span_ns = float(optical.t_ns[-1] - optical.t_ns[0])
             is_contradicted, spread_ns = True, 0.5 * abs(alignment.skew) * span_ns
             problems.append(
@@ -184,6 +193,14 @@ def check_stamps(
                 "that both saw, where crystals hold 100: one of the two is scaled. Poses are as unsure as "
                 f"the motion in the {spread_ns / 1e6:.1f} ms that come together to either end of the run"
             )
+    if alignment is not None and alignment.disagrees_with_stamps:
+        is_contradicted, spread_ns = True, float(np.hypot(spread_ns, alignment.offset_ns))
+        problems.append(
+            f"{abs(alignment.offset_ns) / 1e6:.1f} ms between camera and IMU are more than the sensors' lags: "
+            "the stamps of one of them are wrong throughout. A picture that was lost, or there twice, before "
+            f"the brick turned would do that, by whole periods of {regularity.period_ns / 1e6:.2f} ms. Poses "
+            "of the whole run are as unsure as the motion in that time"
+        )
     of_all_ns = np.zeros(n_frames)
     of_all_ns[frame] = np.hypot(sd_ns, spread_ns)
     return StampCheck(regularity, of_all_ns, tuple(problems), is_contradicted)
@@ -256,5 +273,17 @@ def _change_of_halves(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlign
     t_ns = optical.t_ns[has_pose(optical)]
     return offset_change(
         optical, imu, alignment,
-        split_ns=int(t_ns[len(t_ns) // 2]), from_ns=int(t_ns[0]), to_ns=int(t_ns[-1]),
+        split_ns=int(t_ns[len(t_ns) // 2]), from_ns=int(t_ns[0]), to_ns=int(t_ns[-1]), rate_sd=_FREE_RATE_SD,
     )  # fmt: skip
+
+
+def _runs_apart(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> bool:
+    """Return whether the two clocks drift by more than crystals do, and by more than a sample is old.
+
+    A sensor that samples by a clock of its own, and is read by ours, drifts by a sample's interval at most
+    before it is found out: less than that is its samples' age, which the rate of the alignment follows.
+    """
+    span_ns = float(optical.t_ns[-1] - optical.t_ns[0])
+    beyond = abs(alignment.skew) > _SIGMA * np.hypot(alignment.skew_sd, _CLOCK_RATE_SD)
+    drift_ns = abs(alignment.skew) * span_ns
+    return bool(alignment.source == "data" and beyond and drift_ns > np.median(np.diff(imu.t_ns)))
