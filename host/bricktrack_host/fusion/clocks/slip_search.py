@@ -39,6 +39,7 @@ _CAP = 25.0  # what one frame can say, chi-square
 _CHANGE_PRICE = 60.0
 _EARN = 120.0  # chi-square on either side of a slip against the offset of the other: five frames at least
 _RIVAL = 40.0  # and against every other number of periods
+_COARSE = 0.3  # of both, while the clocks are those that were found with the slips in the stamps
 _DOUBT = 16.0  # by which a place may be less likely than the best: four sigmas
 _MEMORY_S = 0.5  # over which the gyro holds an attitude: its noise, bias and scale drift by more
 _LEAST_SCALE = 0.3  # of attitudes that are better than their covariance says
@@ -125,8 +126,8 @@ def find_slips(
         # A skew, and a clock of the sensor's own, may be how the slip was taken; without, 5 ms are wrong.
         at = replace(alignment, skew=0.0, sample_clock=None)
     slips: StampSlips | None = None
-    for _ in range(2):
-        levels = None if at is None else _levels(_turns(optical, imu, at, regularity.period_ns))
+    for strictness in (_COARSE, 1.0):
+        levels = None if at is None else _levels(_turns(optical, imu, at, regularity.period_ns), strictness)
         if at is None or levels is None:
             return None
         slips = _slips(optical, levels, regularity.period_ns, at, prior_offset_ns, prior_sd_ns)
@@ -175,7 +176,8 @@ def _turns(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, perio
     if len(frame) < MIN_POSES:
         return []
     instants, which = np.unique(t_s, return_inverse=True)
-    A = integrated_attitudes(signal.pieces(), instants, alignment.gyro_bias_radps)[which.reshape(t_s.shape)]
+    A = integrated_attitudes(signal.gyro_pieces(), instants, alignment.gyro_bias_radps)
+    A = A[which.reshape(t_s.shape)]
     R = optical.R_camera_brick[frame]
     start = R[0] @ A[0, A.shape[1] // 2].T
     error = turns_from_gyro(start.T @ R, A)
@@ -190,10 +192,11 @@ def _turns(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, perio
     ]
 
 
-def _levels(at_offsets: list[_Turns]) -> tuple[_Turns, list[int], list[int]] | None:
+def _levels(at_offsets: list[_Turns], strictness: float) -> tuple[_Turns, list[int], list[int]] | None:
     """Return where the shift changes, as numbers of posed frames with both ends, and the shift of each part.
 
-    None where it never does, or the turns do not tell to which shift.
+    None where it never does, or the turns do not tell to which shift, ``strictness`` times as clearly as a
+    slip must be in the end.
     """
     if not at_offsets:
         return None
@@ -207,7 +210,7 @@ def _levels(at_offsets: list[_Turns]) -> tuple[_Turns, list[int], list[int]] | N
             min(cost[others]) - cost[own] for cost, own, others in zip(costs, shifts, beside, strict=True)
         ]
         i = int(np.argmin(earned))
-        if earned[i] >= _EARN:
+        if earned[i] >= strictness * _EARN:
             break
         # What a part does not rule out of the part beside it, it shares.
         shifts[i] = min(beside[i], key=lambda s: float(costs[i][s]))
@@ -218,7 +221,7 @@ def _levels(at_offsets: list[_Turns]) -> tuple[_Turns, list[int], list[int]] | N
         return None
     for part, own in zip(pairwise(ends), shifts, strict=True):
         cost = turns.by_shift(slice(*part))
-        if np.delete(cost, own).min() - cost[own] < _RIVAL:
+        if np.delete(cost, own).min() - cost[own] < strictness * _RIVAL:
             return None  # the motion repeats
     return turns, ends, shifts
 
