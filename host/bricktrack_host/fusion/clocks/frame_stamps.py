@@ -198,8 +198,8 @@ def check_stamps(
         problems.append(
             f"{abs(alignment.offset_ns) / 1e6:.1f} ms between camera and IMU are more than the sensors' lags"
             ": the stamps of one of them are wrong throughout. A picture lost, or there twice, before the "
-            f"brick turned would do that, by whole periods of {regularity.period_ns / 1e6:.2f} ms. Poses of the whole "
-            "run are as unsure as the motion in that time"
+            f"brick turned would do that, by whole periods of {regularity.period_ns / 1e6:.2f} ms. Poses of "
+            "the whole run are as unsure as the motion in that time"
         )
     of_all_ns = np.zeros(n_frames)
     of_all_ns[frame] = np.hypot(sd_ns, spread_ns)
