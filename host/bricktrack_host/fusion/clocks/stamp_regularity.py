@@ -7,6 +7,7 @@ tens of microseconds. What is irregular by more came in elsewhere.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from bricktrack_common.arrays import FloatArray, IntArray
 
@@ -119,15 +120,7 @@ def _steps_and_strays(excess_ns: FloatArray) -> tuple[list[tuple[int, float]], F
     """Return the intervals that stand out of those beside them for good, with sizes, and stamps off alone."""
     n = len(excess_ns)
     limit = max(_STEP_SIGMA * 1.4826 * float(np.median(np.abs(excess_ns))), _STEP_NS)
-    usual = np.array(
-        [
-            [
-                np.median(excess_ns[max(k - _BESIDE, 0) : k]) if k else excess_ns[0],
-                np.median(excess_ns[k + 1 : k + 1 + _BESIDE]) if k < n - 1 else excess_ns[-1],
-            ]
-            for k in range(n)
-        ]
-    )
+    usual = np.stack([_before(excess_ns), _before(excess_ns[::-1])[::-1]], axis=1)
     # Where the rate itself changes, an interval is like those after it: that is no step.
     above = excess_ns[:, None] - usual
     out = (np.abs(above) > limit).all(axis=1) & (above[:, 0] * above[:, 1] > 0)
@@ -149,3 +142,11 @@ def _steps_and_strays(excess_ns: FloatArray) -> tuple[list[tuple[int, float]], F
         else:
             stray[first + 1 : end] = np.cumsum(jump[first : end - 1])
     return steps, stray
+
+
+def _before(values: FloatArray) -> FloatArray:
+    """Return the median of up to `_BESIDE` values before each one; of the first, itself."""
+    first = [np.median(values[:k]) if k else values[0] for k in range(min(_BESIDE, len(values)))]
+    if len(values) <= _BESIDE:
+        return np.array(first)
+    return np.concatenate([first, np.median(sliding_window_view(values, _BESIDE)[:-1], axis=1)])
