@@ -15,16 +15,14 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError
 from bricktrack_common.typed_data import convert, dump_json, load_json
 from bricktrack_host.calibration.calibration_file_v1 import upgraded_from_v1
-from bricktrack_host.calibration.dots.picture_region import ConvexRegion
+from bricktrack_host.calibration.ray_records import CentralRaysRecord, TwoPlaneRecord, model_of, record_of
 from bricktrack_host.calibration.rays.central_rays import CentralRays
 from bricktrack_host.calibration.rays.fit_residuals import PlaneResiduals
 from bricktrack_host.calibration.rays.irt import TwoPlaneIrt
-from bricktrack_host.calibration.rays.pixel_polynomials import n_terms
 from bricktrack_host.calibration.rays.ray_calibration import ModelChoice, RayCalibration
 from bricktrack_host.calibration.rays.ray_fit import PlaneNoise
 from bricktrack_host.calibration.rays.rig_tolerance import RigTolerance, RigUnknown
@@ -33,72 +31,7 @@ FORMAT = "bricktrack-calibration"
 VERSION = 2
 """2: walking pupil, covariance between the planes and with misfit, noise and rig. 1 is still read."""
 
-Row = tuple[float, ...]
-Order = Annotated[int, msgspec.Meta(ge=1, le=20)]
 Millimetres = Annotated[float, msgspec.Meta(gt=0)]
-
-
-class CentralRaysRecord(
-    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="model", tag="central"
-):
-    """`bricktrack_host.calibration.rays.central_rays.CentralRays` as stored.
-
-    Attributes
-    ----------
-    order : int
-    slope_coefficients_x, slope_coefficients_y : tuple of float
-        Of s^i t^j by degree i + j, then by j; s and t are u and v scaled to [-1, 1] across the picture.
-    centre_mm : (float, float, float), mm, camera frame
-    walk_mm : float or None, mm
-        How far the pupil walks along the axis for a ray of slope 1; null where it was not let to.
-    covariance_order : int
-        Highest degree of the covariance's terms.
-    covariance_lower : tuple of float
-        Lower triangle, row by row, of the covariance of [slope x, x0, slope y, y0, z0] and, with a walking
-        pupil, w; the slopes as coefficients of P_i(s) P_j(t), Legendre polynomials, by degree, then by j.
-    covered_px : tuple of (float, float), px
-        Polygon around the dots seen at any plane.
-    """
-
-    order: Order
-    slope_coefficients_x: Row
-    slope_coefficients_y: Row
-    centre_mm: tuple[float, float, float]
-    walk_mm: float | None = None
-    covariance_order: Order
-    covariance_lower: Row
-    covered_px: tuple[tuple[float, float], ...]
-
-
-class TwoPlaneRecord(
-    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="model", tag="two-plane"
-):
-    """`bricktrack_host.calibration.rays.irt.TwoPlaneIrt` as stored.
-
-    Attributes
-    ----------
-    order : int
-    C_a_mm, D_a_mm, C_b_mm, D_b_mm : tuple of float, mm
-        The paper's C (x) and D (y) at planes A and B, of s^i t^j by degree i + j, then by j; s and t are u
-        and v scaled to [-1, 1] across the picture.
-    covariance_order : int
-        Highest degree of the covariance's terms.
-    covariance_lower : tuple of float, mm^2
-        Lower triangle, row by row, of the covariance of [C at A, C at B, D at A, D at B], as coefficients of
-        P_i(s) P_j(t), Legendre polynomials, by degree, then by j.
-    covered_a_px, covered_b_px : tuple of (float, float), px
-        Polygons around the dots seen at either plane.
-    """
-
-    order: Order
-    C_a_mm: Row
-    D_a_mm: Row
-    C_b_mm: Row
-    D_b_mm: Row
-    covariance_order: Order
-    covariance_lower: Row
-    covered_a_px: tuple[tuple[float, float], ...]
-    covered_b_px: tuple[tuple[float, float], ...]
 
 
 class TargetImage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -180,37 +113,11 @@ class Calibration(
     @cached_property
     def ray_model(self) -> CentralRays | TwoPlaneIrt:
         """The calibrated rays; a `bricktrack_common.camera_model.RayModel`."""
-        r = self.rays
-        m, m_covariance = n_terms(r.order), n_terms(r.covariance_order)
-        if r.covariance_order < r.order:
-            raise CalibrationError(
-                f"a covariance of order {r.covariance_order} for rays of order {r.order}: expected as high"
-            )
-        if isinstance(r, CentralRaysRecord):
-            return CentralRays(
-                sensor_mode=self.sensor_mode,
-                plane_a_mm=self.plane_a_mm,
-                plane_b_mm=self.plane_b_mm,
-                order=r.order,
-                coefficients=_rows(m, r.slope_coefficients_x, r.slope_coefficients_y),
-                centre_mm=np.array(r.centre_mm),
-                covariance_order=r.covariance_order,
-                covariance=_full(r.covariance_lower, 2 * m_covariance + (3 if r.walk_mm is None else 4)),
-                region=_region(r.covered_px),
-                residuals=self.residuals,
-                walk_mm=r.walk_mm or 0.0,
-            )
-        return TwoPlaneIrt(
+        return model_of(
+            self.rays,
             sensor_mode=self.sensor_mode,
             plane_a_mm=self.plane_a_mm,
             plane_b_mm=self.plane_b_mm,
-            order=r.order,
-            coefficients_a=_rows(m, r.C_a_mm, r.D_a_mm),
-            coefficients_b=_rows(m, r.C_b_mm, r.D_b_mm),
-            covariance_order=r.covariance_order,
-            covariance=_full(r.covariance_lower, 4 * m_covariance),
-            region_a=_region(r.covered_a_px),
-            region_b=_region(r.covered_b_px),
             residuals=self.residuals,
         )
 
@@ -239,31 +146,9 @@ def make_calibration(
         With its time zone; now where not given.
     """
     model = fitted.model
+    how = "two-plane incident-ray tracking"
     if isinstance(model, CentralRays):
-        rays: CentralRaysRecord | TwoPlaneRecord = CentralRaysRecord(
-            order=model.order,
-            slope_coefficients_x=_tuple(model.coefficients[0]),
-            slope_coefficients_y=_tuple(model.coefficients[1]),
-            centre_mm=(float(model.centre_mm[0]), float(model.centre_mm[1]), float(model.centre_mm[2])),
-            walk_mm=model.walk_mm if model.walks else None,
-            covariance_order=model.covariance_order,
-            covariance_lower=_lower(model.covariance),
-            covered_px=_corners(model.region),
-        )
         how = "central rays with a walking pupil" if model.walks else "central rays"
-    else:
-        rays = TwoPlaneRecord(
-            order=model.order,
-            C_a_mm=_tuple(model.coefficients_a[0]),
-            D_a_mm=_tuple(model.coefficients_a[1]),
-            C_b_mm=_tuple(model.coefficients_b[0]),
-            D_b_mm=_tuple(model.coefficients_b[1]),
-            covariance_order=model.covariance_order,
-            covariance_lower=_lower(model.covariance),
-            covered_a_px=_corners(model.region_a),
-            covered_b_px=_corners(model.region_b),
-        )
-        how = "two-plane incident-ray tracking"
     how += f", {'degrees held by the dots up to' if fitted.choice.held else 'order'} {model.order}"
     return Calibration(
         unit=unit,
@@ -283,7 +168,7 @@ def make_calibration(
         noise=fitted.fit.noise,
         tolerance=fitted.tolerance,
         rig=fitted.fit.rig,
-        rays=rays,
+        rays=record_of(model),
     )
 
 
@@ -399,39 +284,3 @@ def _describe(mode: SensorMode) -> str:
         f"{mode.name!r} ({mode.width} x {mode.height}, crop {mode.crop_width} x {mode.crop_height} at "
         f"({mode.crop_x}, {mode.crop_y}), binning {mode.binning}, rows {mode.row_order})"
     )
-
-
-def _tuple(values: FloatArray) -> Row:
-    return tuple(float(x) for x in values)
-
-
-def _lower(matrix: FloatArray) -> Row:
-    """Return the lower triangle, to nine digits: a covariance is not known better, and files stay small."""
-    return tuple(float(f"{x:.8e}") for x in matrix[np.tril_indices(len(matrix))].tolist())
-
-
-def _corners(region: ConvexRegion) -> tuple[tuple[float, float], ...]:
-    return tuple((float(u), float(v)) for u, v in region.vertices_px)
-
-
-def _full(lower: Row, n: int) -> FloatArray:
-    if len(lower) != n * (n + 1) // 2:
-        raise CalibrationError(
-            f"a covariance of {len(lower)} numbers; expected {n * (n + 1) // 2} for {n} coefficients"
-        )
-    matrix = np.zeros((n, n))
-    matrix[np.tril_indices(n)] = lower
-    return matrix + np.tril(matrix, -1).T
-
-
-def _rows(n: int, *rows: Row) -> FloatArray:
-    for row in rows:
-        if len(row) != n:
-            raise CalibrationError(f"{len(row)} coefficients; expected {n} for the order given")
-    return np.array(rows, dtype=np.float64)
-
-
-def _region(corners: tuple[tuple[float, float], ...]) -> ConvexRegion:
-    if len(corners) < 3:
-        raise CalibrationError(f"a covered region of {len(corners)} corners; expected three or more")
-    return ConvexRegion(np.array(corners, dtype=np.float64))

@@ -3,7 +3,8 @@
 import numpy as np
 
 from bricktrack_common.errors import TrackingError
-from bricktrack_host.calibration.calibration_file import Calibration, CentralRaysRecord
+from bricktrack_host.calibration.calibration_file import Calibration
+from bricktrack_host.calibration.ray_records import CentralRaysRecord
 from bricktrack_host.fusion.estimate import FusionResult
 from bricktrack_host.fusion.mount import check_chip_orientation
 from bricktrack_host.reporting.fusion_check import CHECK_PREFIX
