@@ -1,8 +1,11 @@
 """From a recording (simulated) whose camera is shaken and rocked to its fused motion, by the command line."""
 
+import shutil
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from page_commands import type_all
 from shaken_pair import import_twin, make_shaken_pair
 from typer.testing import CliRunner
 
@@ -128,6 +131,19 @@ def test_the_tables_samples_come_by_their_number(pair):
     assert found.kind == "table" and not found.imu.gyro_radps.any()
     rms = np.sqrt(np.mean(found.imu.acc_mps2**2, axis=0)) / 9.80665
     assert (rms > 0.15).all() and (rms < 0.45).all()  # 0.3 g over the shake, and rest around it
+
+
+def test_the_how_to_pages_command_joins_the_tables_csv(pair, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs" / "b7-2_9f31c2_0007_shake-12"
+    shutil.copytree(pair.run, run)
+    shutil.copy(pair.table, tmp_path / "shake-12.csv")
+    fleet = _FLEETS["table"].replace("calibration.json", str(pair.calibration))
+    (tmp_path / "fleet.toml").write_text(fleet.replace("kit/layout.toml", str(pair.layout)))
+    type_all("moving-camera.md")
+    result = read_result(run / "results")
+    assert result.provenance.settings["camera"] == "table"
+    assert result.alignment["camera_sensor"] == "table"
 
 
 def test_what_is_missing_is_named_with_its_remedy(pair, tmp_path):
