@@ -198,7 +198,7 @@ def _print(fitted: RayCalibration, *, names: list[str], simulated: bool) -> None
     console.print(f"Model: {choice.reason}")
     share = float(np.mean(covered))
     both = " at both planes" if choice.model == "two-plane" else ""
-    console.print(f"Dots surround {share:.0%} of the picture{both}.")
+    console.print(f"Dots surround {100 * share:.0f} % of the picture{both}.")
     if share < WARN_BELOW_COVERED:
         console.print(
             "Warning: rays outside are extrapolated. Take a larger target, or bring the planes nearer.",

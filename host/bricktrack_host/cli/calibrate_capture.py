@@ -304,9 +304,12 @@ def _report(
     table = Table(title=f"Target at {at_mm:g} mm, unit {session.unit}{simulated}", show_header=False)
     for row in (
         ("dots with a place on the target", f"{check.n_placed} of {check.n_dots} found"),
-        ("picture among the dots", f"{check.covered:.0%}"),
+        ("picture among the dots", f"{100 * check.covered:.0f} %"),
         ("blur of the rims", f"{check.blur_px:.1f} px, dots {2 * check.radius_px:.0f} px across"),
-        ("light of the dots", f"{check.light:.0%} of full, {check.contrast:.0%} over the background"),
+        (
+            "light of the dots",
+            f"{100 * check.light:.0f} % of full, {100 * check.contrast:.0f} % over the background",
+        ),
         ("tilt", f"{check.pose.tilt_deg:.2f} +- {check.pose.tilt_sd_deg:.2f} degrees"),
         ("turn", f"{check.pose.turn_deg:.1f} degrees"),
     ):

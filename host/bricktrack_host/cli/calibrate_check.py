@@ -191,5 +191,5 @@ def _report(
     table.add_row("depth found, mm", *(f"{p.depth_mm:.3f} +- {p.depth_sd_mm:.3f}" for p in pages))
     table.add_row("depth given, mm", *("" if z is None else f"{z:.3f}" for z in depths))
     table.add_row("tilt, degrees", *(f"{p.tilt_deg:.2f}" for p in pages))
-    table.add_row("dots that the calibration covers", *(f"{p.covered:.0%}" for p in pages))
+    table.add_row("dots that the calibration covers", *(f"{100 * p.covered:.0f} %" for p in pages))
     out.print(table)

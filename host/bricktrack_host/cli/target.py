@@ -96,7 +96,7 @@ def target(
             f"{letter}, {field.z_mm:g} mm",
             f"{field.width_mm:.0f} x {field.height_mm:.0f}",
             f"{seen[0]} x {seen[1]}",
-            f"{field.share_filled(board):.0%}",
+            f"{100 * field.share_filled(board):.0f} %",
             f"{px:.0f}",
         )
     out.print(table)

@@ -87,7 +87,8 @@ class AimPane:
         self._advice.text = "\n".join(seen.advice)
         self._picture.set_source(seen.picture_uri)
         self._exposure.text = (
-            f"{seen.exposure_us / 1000:g} ms, gain {seen.gain:.2f}; {seen.full_share:.2%} of the pixels at "
+            f"{seen.exposure_us / 1000:g} ms, gain {seen.gain:.2f}; {100 * seen.full_share:.2f} % of the "
+            "pixels at "
             "full level"
         )
         self._histogram.content = seen.histogram_svg

@@ -150,7 +150,7 @@ def uncertainty_figure(
             inside = leds.contains(uv)
             words = f"; LEDs up to {size[inside].max():.1f} um" if inside.any() else ""
         else:
-            words = f"; median {np.median(size):.1f} um"
+            words = f"; median {np.median(size):.2g} um"
         ax.set_title(f"z = {z_mm:.1f} mm{words}")
         ax.set(xlim=(-0.5, mode.width - 0.5), ylim=(mode.height - 0.5, -0.5), xlabel="u, px")
         ax.grid(visible=False)

@@ -100,12 +100,14 @@ def verdict(evidence: CalibrationEvidence) -> tuple[str, list[str]]:
     share = evidence.covered_share
     if share < WARN_BELOW_COVERED:
         problems.append(
-            f"Dots surround only {share:.0%} of the picture; rays outside are extrapolated. Take a larger "
+            f"Dots surround only {100 * share:.0f} % of the picture; rays outside are extrapolated. Take a "
+            "larger "
             "target, or bring the planes nearer."
         )
     if evidence.leds_covered is not None and evidence.leds_covered < 1:
         problems.append(
-            f"{1 - evidence.leds_covered:.0%} of the places where LEDs may be seen lie outside the dots."
+            f"{100 * (1 - evidence.leds_covered):.0f} % of the places where LEDs may be seen lie outside "
+            "the dots."
         )
     problems += [
         f"The pictures contradict the rig: {u.name} by {np.rad2deg(u.value):.3f} ± {np.rad2deg(u.sd):.3f} "
@@ -162,7 +164,7 @@ def _key_figures(evidence: CalibrationEvidence) -> list[Key]:
         Key("Dots", " · ".join(str(r.n_dots) for r in model.residuals),
              f"{sum(fitted.n_left_out)} left out as contradicting"),
         Key("Error at left-out dots", f"{chosen.rms_um:.2f} um", f"rms; {chosen.max_um:.1f} um at most"),
-        Key("Picture covered", f"{evidence.covered_share:.0%}", "by dots around"),
+        Key("Picture covered", f"{100 * evidence.covered_share:.0f} %", "by dots around"),
         Key("Rays known to", f"{np.median(sd_um[model.is_covered(uv)]):.2f} um",
              "95 %, median where covered, midway"),
     ]  # fmt: skip

@@ -133,12 +133,13 @@ def _left_out(e: CalibrationEvidence, figures: dict[str, Figure]) -> Section:
 
 def _coverage(e: CalibrationEvidence, figures: dict[str, Figure]) -> Section:
     model = e.fitted.model
-    words = [f"Dots surround {e.covered_share:.0%} of the picture"
+    words = [f"Dots surround {100 * e.covered_share:.0f} % of the picture"
              + ("." if isinstance(model, CentralRays) else " at both planes.")
              + " Rays outside are extrapolated, and samples that use one are flagged."]  # fmt: skip
     if e.leds_covered is not None:
         words.append(
-            f"Dots surround {e.leds_covered:.0%} of the places where the layout's LEDs are seen with the "
+            f"Dots surround {100 * e.leds_covered:.0f} % of the places where the layout's LEDs are seen "
+            "with the "
             "brick on the axis, from the near plane to the far one, and 5 mm off to either side."
         )
     figures["coverage"] = draw.coverage_figure(model.sensor_mode, e.fitted.planes, e.covered, e.leds)
@@ -228,7 +229,8 @@ def _comparison(
             f"rms at z = {c.z_mm:.1f} mm.",
             f"A motion of the camera on the rig by ({shift[0]:+.3f}, {shift[1]:+.3f}, {shift[2]:+.3f}) mm "
             f"and ({turn[0]:+.4f}, {turn[1]:+.4f}, {turn[2]:+.4f}) degrees leaves {left:.1f} um rms; of the "
-            f"pixels, {c.explained_share:.0%} are then within both calibrations' 95 % uncertainty. What is "
+            f"pixels, {100 * c.explained_share:.0f} % are then within both calibrations' 95 % uncertainty. "
+            "What is "
             "left is the lens's.",
         ],
     )

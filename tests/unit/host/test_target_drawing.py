@@ -101,7 +101,7 @@ def test_the_command_writes_the_drawing_and_its_description(tmp_path):
     # tan(29.5 degrees) * 2 * 161.111 = 182.3 mm of picture.
     assert target.columns == 52
     assert "182 x 103" in result.output
-    assert "100%" in result.output
+    assert "100 %" in result.output
     paper = run("-o", tmp_path / "p.pdf", "--plain", "--columns", 32, "--rows", 18, "--pitch-mm", 4)
     assert "Change --pitch-mm" in paper.output  # 1080p crop: dots of 54 px at plane A
     assert not load_target(tmp_path / "p.toml").coded

@@ -126,7 +126,8 @@ def _coverage_warnings(uv_px: FloatArray, size_px: tuple[int, int], covered: flo
             bare.append(f"{gap:.0f} px at the {name}")
     where = f" ({', '.join(bare)} without dots)" if bare else ""
     return [
-        f"dots surround {covered:.0%} of the picture{where}: rays beyond are extrapolated. Take a larger "
+        f"dots surround {100 * covered:.0f} % of the picture{where}: rays beyond are extrapolated. Take a "
+        "larger "
         "target, or add pictures with it shifted"
     ]
 
@@ -157,15 +158,18 @@ def _light_warnings(light: FloatArray, contrast: FloatArray, saturated: float) -
     words = []
     if saturated > 0.02:
         words.append(
-            f"{saturated:.0%} of the dots are at full light: rims seem wider than they are. Expose for less"
+            f"{100 * saturated:.0f} % of the dots are at full light: rims seem wider than they are. Expose "
+            "for less"
         )
     if np.median(light) < DIM:
         words.append(
-            f"dim: dots reach {np.median(light):.0%} of full light; 50 to 90 % is best. Expose for more"
+            f"dim: dots reach {100 * np.median(light):.0f} % of full light; 50 to 90 % is best. Expose for "
+            "more"
         )
     elif np.percentile(contrast, 2) < FAINT:
         words.append(
-            f"faint: some dots stand out by {np.percentile(contrast, 2):.0%} of full light only; light the "
+            f"faint: some dots stand out by {100 * np.percentile(contrast, 2):.0f} % of full light only; "
+            "light the "
             "target evenly and without glare"
         )
     low, high = np.percentile(light, [2, 98])
