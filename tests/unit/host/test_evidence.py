@@ -1,27 +1,35 @@
 import numpy as np
+import pytest
+from led_scenes import random_poses, seven_leds
+from pinhole import PinholeCamera
+from scipy.stats import multivariate_normal
 
-from bricktrack_host.tracking.identity.evidence import evidence_of
+from bricktrack_host.tracking.identity.evidence import Given, Shown, evidence_of, log_area_ratio
+from bricktrack_host.tracking.led_model.led_profile import predict_brick
 
 N_PIXELS = 1920 * 1080
-AREA = 3000.0
+COLLAR = 0.7
+BRICK = seven_leds(collar_mm=COLLAR)
+POSE = random_poses(1, seed=3, tilt_deg=15.0)
+SEEN, J = predict_brick(*POSE, PinholeCamera(), BRICK, collar_mm=COLLAR)
+TWIST_SD = np.repeat([1.0, 300.0], 3)
+WITHOUT_THE_LAST = np.arange(7) < 6
 
 
-def evidence(residual, *, kept=None, area=AREA, sd_px=0.06, whole=True, shift_sd=0.005):
-    """Of one assignment of seven LEDs that face the camera squarely."""
-    residual = np.asarray(residual, dtype=float)[None]
-    kept = np.ones((1, 7), dtype=bool) if kept is None else np.asarray(kept)[None]
-    return evidence_of(
-        residual,
-        np.broadcast_to(sd_px**2 * np.eye(2), (1, 7, 2, 2)),
-        np.broadcast_to(np.asarray(whole), (1, 7)),
-        kept,
-        np.broadcast_to(np.asarray(area, dtype=float), (1, 7)),
-        np.full((1, 7), AREA),
-        np.ones((1, 7)),
-        shift_sd_per_radius=shift_sd,
-        n_pixels=N_PIXELS,
-        min_leds=4,
+def evidence(off_px, *, kept=None, area=1.0, sd_px=0.06, whole=True, n_lights=7, guesses=1, dt_s=0.0):
+    """Of one assignment, whose lights are off from where a pose shows the LEDs."""
+    given = Given(
+        uv_px=SEEN.uv_px + np.asarray(off_px, dtype=float),
+        cov_px2=np.broadcast_to(sd_px**2 * np.eye(2), (1, 7, 2, 2)),
+        area_px2=SEEN.area_px2 * area,
+        is_whole=np.broadcast_to(np.asarray(whole), (1, 7)),
+        dt_s=np.broadcast_to(np.asarray(dt_s, dtype=float), (1, 7)),
+        twist_sd=TWIST_SD[None],
+        n_lights=np.array([n_lights]),
     )
+    shown = Shown(SEEN.uv_px, SEEN.area_px2, SEEN.facing, J, SEEN.model_shift_px)
+    kept = np.ones((1, 7), dtype=bool) if kept is None else np.asarray(kept)[None]
+    return evidence_of(given, [shown] * guesses, kept, POSE[1][:, 2], n_pixels=N_PIXELS, min_leds=4)
 
 
 def noise(sd_px, seed=1):
@@ -30,35 +38,79 @@ def noise(sd_px, seed=1):
 
 def test_an_led_more_that_fits_is_evidence_by_what_lights_anywhere_would_need():
     r = noise(0.06)
-    six = np.arange(7) < 6
-    gain = evidence(r).log_ratio - evidence(r, kept=six).log_ratio
-    # A light within a few hundredths of a pixel of its place, in two million: log of 2e6 / (2 pi 0.08^2), about.
-    assert 14 < gain[0] < 21
+    gain = evidence(r).log_ratio - evidence(r, kept=WITHOUT_THE_LAST).log_ratio
+    # Half a pixel about where the others show it, in two million; nine to one that it is not hidden; the area.
+    assert np.log(N_PIXELS / (2 * np.pi * 0.5**2)) < gain[0] < np.log(N_PIXELS / (2 * np.pi * 0.05**2)) + 5
+
+
+def test_places_at_rest_have_the_density_of_normal_lights_over_all_poses():
+    """All that is unknown as one covariance of all lights' places: the density by another way."""
+    r = noise(0.06)
+    rows = J[0].reshape(14, 6)
+    profile = SEEN.model_shift_px[0].reshape(14, 1)
+    own = np.repeat(0.25 * (SEEN.model_shift_px[0] ** 2).sum(axis=1), 2)
+    radius2 = np.repeat(SEEN.area_px2[0] / np.pi, 2)
+    wide = np.repeat([1.0, 50.0], 3)  # rad, mm: flat, but for its known height
+    log_p = []
+    for share, radii in ((0.8, 0.0), (0.15, 0.01), (0.05, 0.04)):
+        S = (
+            np.diag(0.06**2 + 0.05**2 + own + radii**2 * radius2)
+            + (rows * wide**2) @ rows.T
+            + profile @ profile.T
+        )
+        log_p.append(np.log(share) + multivariate_normal(np.zeros(14), S).logpdf(r.ravel()))
+    flat = np.logaddexp.reduce(log_p) + 3 * np.log(2 * np.pi) + np.log(wide).sum()
+    # Seven LEDs shown, none hidden, no false light; the areas as predicted; bricks wherever a camera sees them.
+    m2 = np.abs(np.linalg.det(J[0, :, :, 3:5])).mean()
+    z = POSE[1][0, 2]
+    n_poses = 4 * np.pi**2 * 2.6 * N_PIXELS * z / m2
+    others = (
+        7 * np.log(0.9 * 1.2 * N_PIXELS) - np.log(5040) + 7 * log_area_ratio(np.zeros(1))[0] - np.log(n_poses)
+    )
+    # Motion that shows nothing, at dt = 0, changes nothing; det(AB) of a wide Gauss: to a part in 10^4 or so.
+    assert evidence(r).log_ratio[0] == pytest.approx(flat + others, abs=0.02)
 
 
 def test_one_false_light_among_six_that_fit_is_worse_than_none():
     r = noise(0.06)
     r[6] = [5.0, -4.0]
-    six = np.arange(7) < 6
-    assert evidence(r, kept=six).log_ratio > evidence(r).log_ratio
-    assert evidence(r).is_scattered.all() and not evidence(r, kept=six).is_scattered.any()
+    assert evidence(r, kept=WITHOUT_THE_LAST).log_ratio > evidence(r).log_ratio
+    assert evidence(r).is_scattered.all() and not evidence(r, kept=WITHOUT_THE_LAST).is_scattered.any()
 
 
-def test_a_moving_brick_keeps_its_leds_though_all_residuals_are_large():
-    r = noise(2.0)
-    six = np.arange(7) < 6
-    assert evidence(r).log_ratio > evidence(r, kept=six).log_ratio + 5
+def test_a_moving_brick_keeps_its_leds_and_a_false_light_is_not_taken_for_motion():
+    dt_s = (SEEN.uv_px[0, :, 1] - 540) * 19e-6
+    motion_px = np.einsum("lij,j->li", J[0, :, :, 3:], [200.0, 0.0, 0.0]) * dt_s[:, None]
+    r = motion_px + noise(0.06)
+    assert np.linalg.norm(r, axis=1).max() > 5
+    all_seven, six = evidence(r, dt_s=dt_s), evidence(r, kept=WITHOUT_THE_LAST, dt_s=dt_s)
+    assert all_seven.is_scattered.all()
+    assert all_seven.log_ratio > six.log_ratio + 5
+    moved = r.copy()
+    moved[6] += [12.0, -9.0]  # no speed shows the LED there
+    assert evidence(moved, dt_s=dt_s).log_ratio < six.log_ratio
 
 
 def test_a_light_of_another_size_is_less_like_an_led_and_a_common_factor_is_not():
     r = noise(0.06)
-    area = np.full(7, AREA)
-    brighter = evidence(r, area=1.3 * area).log_ratio
-    np.testing.assert_allclose(brighter, evidence(r, area=area).log_ratio, atol=1e-9)
+    area = np.ones(7)
+    np.testing.assert_allclose(evidence(r, area=1.3).log_ratio, evidence(r).log_ratio, atol=1e-9)
     area[3] *= 3
     assert evidence(r, area=area).log_ratio < evidence(r).log_ratio - 3
     whole = np.arange(7) != 3  # a cut light's size says nothing
-    assert evidence(r, area=area, whole=whole).log_ratio > evidence(r, area=area).log_ratio - 3
+    np.testing.assert_allclose(
+        evidence(r, area=area, whole=whole).log_ratio, evidence(r, whole=whole).log_ratio, atol=1e-9
+    )
+
+
+def test_more_false_lights_make_each_led_less_sure():
+    r = noise(0.06)
+    # Of five false lights, rather than none, one is where the LED is six times as likely.
+    gain = [
+        evidence(r, n_lights=n).log_ratio - evidence(r, n_lights=n, kept=WITHOUT_THE_LAST).log_ratio
+        for n in (7, 12)
+    ]
+    np.testing.assert_allclose(gain[0] - gain[1], np.log(6.0), atol=1e-9)
 
 
 def test_too_few_leds_and_no_pose_are_no_evidence():
@@ -66,7 +118,6 @@ def test_too_few_leds_and_no_pose_are_no_evidence():
     assert evidence(np.full((7, 2), np.nan)).log_ratio == -np.inf
 
 
-def test_without_a_fitted_profile_small_residuals_speak_less_and_large_ones_more():
-    fits, scatters = noise(0.06), noise(1.5)
-    assert evidence(fits).log_ratio > evidence(fits, shift_sd=None).log_ratio
-    assert evidence(scatters, shift_sd=None).log_ratio > evidence(scatters).log_ratio
+def test_without_a_fitted_profile_small_residuals_speak_less():
+    fits = noise(0.06)
+    assert evidence(fits).log_ratio > evidence(fits, guesses=2).log_ratio

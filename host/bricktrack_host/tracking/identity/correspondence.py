@@ -1,15 +1,13 @@
 """Which blob is which LED, for any layout, from nothing.
 
 Poses from triples of blobs and LEDs (`identity_search`), the likeliest of them fitted to the pixels
-(`verification`) and compared (`evidence`). `pattern` carries identities from picture to picture, and
-`paper_rules` has the source paper's way for its own layout.
+(`verification`) and compared by their `evidence` (`identity_verdict`). `pattern` carries identities from
+picture to picture, and `paper_rules` has the source paper's way for its own layout.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
-from scipy.special import gammaln
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
@@ -17,23 +15,20 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.tracking.identity.identity_candidates import N_KEPT, Candidates, Pattern
 from bricktrack_host.tracking.identity.identity_search import Lights, propose
+from bricktrack_host.tracking.identity.identity_verdict import Pictures
 from bricktrack_host.tracking.identity.verification import (
     MIN_FACING,
     MIN_INLIERS,
     Correspondence,
-    RunLights,
     identity_gate_px,
     no_correspondence,
     verified_correspondence,
-    verify,
 )
 from bricktrack_host.tracking.led_model.hit_polynomials import expand_at, hit_polynomials
 from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracking.pose.p3p import ray_centre_mm
 
 MAX_SEARCH_BLOBS = 12
-_RIVAL_EVIDENCE = 5.0  # log likelihood: 150 to one
-_CHANCE_EVIDENCE = float(np.log(1e5))  # an answer is to be wrong in at most one of so many pictures
 _SHOWN_AREA = 0.8  # of its disc: a dome shows between half and all of it
 
 
@@ -61,8 +56,8 @@ def search_correspondences(
     Returns
     -------
     list of Correspondence
-        Ambiguous where another assignment is less than 150 times less likely, or where among as many
-        assignments as there are one would fit as well by chance: in one of 100,000 pictures, or more. Two
+        LEDs whose lights are in doubt are left out. Ambiguous where that leaves fewer than four, or four in a
+        line, or where false lights alone would fit as well in more than one picture of 1000. Two
         poses of one assignment are no ambiguity of identity: the poses' stage tells them apart, or says so.
 
     Raises
@@ -86,58 +81,31 @@ def search_correspondences(
         out[searched[empty]] = no_correspondence(n_leds, "no pose brings four LEDs onto blobs")
     if of.size == 0:
         return out
-    assigned = found.blob_of_led[of, number]
-    verified = verify(
-        RunLights.of(blobs).of_leds(of, assigned),
-        (found.R[of, number], found.t[of, number] + centre),
+    seen = Pictures(
+        blobs,
         ray_model,
         brick_model,
         collar_mm=collar_mm,
-        gate_px=np.array([identity_gate_px(r) for r in radius_px])[of],
-        picture=of,
+        gate_px=np.array([identity_gate_px(r) for r in radius_px]),
     )
-    kept = np.where(verified.kept, assigned, -1)
-    order = np.lexsort((-verified.log_evidence, of))
-    starts = np.searchsorted(of[order], np.arange(len(blobs) + 1))
-    for row, (begin, end) in enumerate(pairwise(starts)):
-        if begin == end:
+    start = (found.R[of, number], found.t[of, number] + centre)
+    verdict = seen.decide(of, found.blob_of_led[of, number], start)
+    for row, i in enumerate(searched):
+        if found.number[row] == 0:
             continue
-        ranked = order[begin:end]
-        best = int(ranked[0])
-        evidence = verified.log_evidence[ranked]
-        if not np.isfinite(evidence[0]):
-            out[searched[row]] = no_correspondence(n_leds, "no pose explains four LEDs within the gate")
-        elif _has_rival(kept[ranked], evidence):
-            out[searched[row]] = no_correspondence(n_leds, "two assignments fit equally well", ambiguous=True)
-        elif evidence[0] < _chance_evidence(len(blobs[row]), kept[best]):
-            reason = f"among {len(blobs[row])} lights, {(kept[best] >= 0).sum()} fit as well by chance"
-            out[searched[row]] = no_correspondence(n_leds, reason, ambiguous=True)
+        at, n_lit = verdict.row[row], len(blobs[row])
+        if at < 0:
+            out[i] = no_correspondence(n_leds, "no pose explains four LEDs within the gate")
+        elif verdict.is_chance[row]:
+            reason = f"among {n_lit} lights, {verdict.n_leds[row]} fit as well by chance"
+            out[i] = no_correspondence(n_leds, reason, ambiguous=True)
+        elif verdict.has_rival[row]:
+            out[i] = no_correspondence(n_leds, "two assignments fit equally well", ambiguous=True)
         else:
-            original = chosen[row][1]
-            answer = np.where(kept[best] >= 0, original[np.maximum(kept[best], 0)], -1)
-            out[searched[row]] = verified_correspondence(answer, verified.poses, best)
+            answer = verdict.blob_of_led[row]
+            answer = np.where(answer >= 0, chosen[row][1][np.maximum(answer, 0)], -1)
+            out[i] = verified_correspondence(answer, verdict.poses, at)
     return out
-
-
-def _has_rival(kept: IntArray, evidence: FloatArray) -> bool:
-    """Tell whether an assignment that contradicts the first is nearly as likely; rows are ranked.
-
-    Contradicts: it gives an LED another light, or a light another LED. One that only leaves LEDs out, or adds
-    them, does not, unless it is the added LED that is in doubt: then that has lost already.
-    """
-    near = evidence > evidence[0] - _RIVAL_EVIDENCE
-    return bool((near & (kept != kept[0]).any(axis=1))[1:].any())
-
-
-def _chance_evidence(n_lights: int, kept: IntArray) -> float:
-    """Return the log likelihood that the best of all assignments of so many LEDs may reach by chance.
-
-    The false ones' likelihood ratios have a mean of one: that of N of them is above x in N / x cases at most.
-    """
-    n_leds, n = len(kept), int((kept >= 0).sum())
-    which_leds = gammaln(n_leds + 1) - gammaln(n + 1) - gammaln(n_leds - n + 1)
-    which_lights = gammaln(n_lights + 1) - gammaln(n_lights - n + 1)
-    return float(which_leds + which_lights) + _CHANCE_EVIDENCE
 
 
 def _likeliest(blobs: Blobs) -> tuple[Blobs, IntArray]:

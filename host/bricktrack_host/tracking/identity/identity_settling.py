@@ -158,8 +158,10 @@ def _mend_lurches(run: RunIdentities, tight_px: FloatArray) -> FloatArray:
     verified = run.verify(
         lights,
         (known_R[at], t_mm[at]),
+        weighed=True,
         motion=motion_of(run.motion(rest).within, at),
         gate_px=tight_px[at],
+        n_lights=run.lights.count[at],
     )
     left = turn_between(_attitudes(verified), between[at])
     enough = verified.kept.sum(axis=1) >= MIN_INLIERS
@@ -256,6 +258,7 @@ def _verify_known(
         intruders=intruders,
         motion=motion_of(motion.within, frames) if within is None else within,
         gate_px=gate_px[frames],
+        n_lights=run.lights.count[frames],
     )
 
 

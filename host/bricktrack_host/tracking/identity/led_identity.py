@@ -196,7 +196,10 @@ def _verified(
     if suspect.size == 0:
         return verified
     start = (verified.poses.R_camera_brick[suspect], verified.poses.t_camera_brick_mm[suspect])
-    return verified.replaced(suspect, run.verify(lights.take(suspect), start, intruders=True))
+    return verified.replaced(
+        suspect,
+        run.verify(lights.take(suspect), start, intruders=True, n_lights=run.lights.count[frames[suspect]]),
+    )
 
 
 def _grow(run: RunIdentities) -> int:
@@ -226,7 +229,13 @@ def _grow(run: RunIdentities) -> int:
         if bad.size:  # a false light may be among them
             some = lights.take(bad)
             unknown = unknown_motion(some.uv_px, run.ray_model)
-            again = run.verify(some, (start[0][bad], start[1][bad]), intruders=True, motion=unknown)
+            again = run.verify(
+                some,
+                (start[0][bad], start[1][bad]),
+                intruders=True,
+                motion=unknown,
+                n_lights=run.lights.count[frames[bad]],
+            )
             verified = verified.replaced(bad, again)
         n_kept = np.where(verified.poses.chi2 <= _BELIEVED_CHI2, verified.kept.sum(axis=1), 0)
         order = np.lexsort((-n_kept, frames))

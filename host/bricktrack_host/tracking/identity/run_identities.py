@@ -19,6 +19,7 @@ from bricktrack_host.tracking.identity.verification import (
     RunLights,
     Verified,
     identity_gate_px,
+    in_line,
     verify,
 )
 from bricktrack_host.tracking.led_model.led_profile import LedPrediction, predict_brick
@@ -130,12 +131,14 @@ class RunIdentities:
         starts: tuple[FloatArray, FloatArray],
         *,
         intruders: bool = False,
+        weighed: bool = False,
         motion: LedMotion | None = None,
         gate_px: FloatArray | None = None,
+        n_lights: IntArray | None = None,
     ) -> Verified:
         """Verify assignments; ``gate_px``, of each one, is that of whole lights: cut ones have the usual."""
         gate = np.full(len(lights.uv_px), self.gate_px) if gate_px is None else gate_px
-        return verify(
+        verified = verify(
             lights,
             starts,
             self.ray_model,
@@ -143,8 +146,12 @@ class RunIdentities:
             collar_mm=self.collar_mm,
             gate_px=np.where(lights.is_whole, gate[:, None], self.gate_px),
             intruders=intruders,
+            weighed=weighed,
             motion=motion,
+            n_lights=n_lights,
         )
+        verified.kept[in_line(verified.kept, self.brick_model)] = False
+        return verified
 
     def take(
         self, frames: IntArray, assigned: IntArray, verified: Verified, better: BoolArray | None = None

@@ -12,10 +12,13 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of, with_rows
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
-from bricktrack_host.tracking.identity.evidence import Evidence, evidence_of
-from bricktrack_host.tracking.led_model.led_profile import shift_per_radius
+from bricktrack_common.rotations import matrix_from_rvec
+from bricktrack_host.tracking.identity.evidence import Evidence, Given, Shown, evidence_of
+from bricktrack_host.tracking.identity.identity_motion import unknown_motion
+from bricktrack_host.tracking.led_model.led_profile import predict_brick, shift_per_radius
 from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.frame_motion import UNKNOWN_TWIST_SD
 from bricktrack_host.tracking.pose.prsoi import ROUGH_MM, prsoi_starts
 from bricktrack_host.tracking.pose.refine import LedMotion, RefinedPoses, refine_poses
 
@@ -23,8 +26,11 @@ MIN_INLIERS = 4
 MIN_FACING = 0.05
 """Cosine between an LED's axis and the line of sight below which it is not believed to be seen."""
 _MAX_BAD, _MAX_INTRUDERS = 3, 2
-_SURE = 10.0
-"""Log likelihood that an LED must add to be believed where all the others fit as well as centroids can."""
+_COLLARS, _BETWEEN_COLLARS = (0.0, 0.2, 0.4, 0.6), 0.05
+"""Guesses of a collar that was not fitted, in LED radii, and what each leaves, about: the shift of the
+centroid to the next guess, in radii times the sine of the view angle."""
+_SLIM = 1e-3  # ratio of the singular values of the positions of LEDs in one line
+_ANY_MM = np.array([0.0, 0.0, 130.0])  # in place of what is not known
 _HOPELESS = 25.0  # log likelihood below the best of the picture: an intruder left out does not make up for it
 _CUT_SD_GATES = 0.9
 """Trust in a cut light, over the gate: what is left has its centroid elsewhere, up to a radius."""
@@ -175,11 +181,14 @@ class Verified:
     poses : RefinedPoses
     log_evidence : ndarray, shape (n,)
         See `evidence`.
+    is_scattered : ndarray of bool, shape (n,)
+        The residuals are larger than those of a brick at rest.
     """
 
     kept: BoolArray
     poses: RefinedPoses
     log_evidence: FloatArray
+    is_scattered: BoolArray
 
     def take(self, rows: IntArray) -> "Verified":
         """Return some of the assignments."""
@@ -200,7 +209,9 @@ def verify(
     gate_px: FloatArray | float,
     picture: IntArray | None = None,
     intruders: bool = True,
+    weighed: bool = True,
     motion: LedMotion | None = None,
+    n_lights: IntArray | None = None,
 ) -> Verified:
     """Fit poses to assignments and keep the LEDs that each pose explains.
 
@@ -216,15 +227,19 @@ def verify(
         Assignments of one picture compete: the hopeless are not looked at further. Default: each has its own.
     intruders : bool
         False: LEDs are left out only beyond the gate, however much the residuals scatter.
+    weighed : bool
+        False: without intruders, the evidence is not wanted, and NaN.
     motion : LedMotion, optional
         How the brick moves within each of the n pictures, read out row by row; default: not at all.
+    n_lights : ndarray of int64, shape (n,), optional
+        Of each one's picture; default: as many as there are LEDs.
 
     Notes
     -----
     LEDs beyond the gate, or that the pose hides, are left out one at a time, the worst: a false light drags
     its neighbours' residuals with it. Where residuals scatter more than centroids do, a false light may be
     among them: the assignment is tried without each of its LEDs. The likeliest of these is taken where it is
-    likelier, or where all others then fit and the LED that it lacks does not speak for itself beyond doubt.
+    likelier.
     """
     uv = lights.uv_px.copy()
     n = len(uv)
@@ -232,13 +247,13 @@ def verify(
     gate = np.asarray(gate_px, dtype=np.float64)
     gate = np.broadcast_to(gate[:, None] if gate.ndim == 1 else gate, uv.shape[:2])
     picture = np.arange(n) if picture is None else picture
+    n_lights = np.full(n, brick_model.n_leds) if n_lights is None else n_lights
     mode = ray_model.sensor_mode
     variance = np.where(lights.is_whole, _IDENTITY_SD_PX**2, (_CUT_SD_GATES * gate) ** 2)
     cov = variance[..., None, None] * np.eye(2)
-    shift_sd = None if collar_mm is None else shift_per_radius(collar_mm, brick_model)
 
-    def fit(rows: IntArray, uv: FloatArray, R: FloatArray, t: FloatArray) -> tuple[RefinedPoses, Evidence]:
-        poses = refine_poses(
+    def fit(rows: IntArray, uv: FloatArray, R: FloatArray, t: FloatArray) -> RefinedPoses:
+        return refine_poses(
             uv,
             cov[rows],
             R,
@@ -249,16 +264,15 @@ def verify(
             motion=None if motion is None else motion_of(motion, rows),
             max_steps=6,
         )
-        some = lights.take(rows)
-        return poses, evidence_of(
-            poses.residual_px,
-            some.cov_px2,
-            some.is_whole,
+
+    def weigh(rows: IntArray, uv: FloatArray, poses: RefinedPoses) -> Evidence:
+        within = None if motion is None else motion_of(motion, rows)
+        given = _given(lights.take(rows), uv, within, n_lights[rows], ray_model)
+        return evidence_of(
+            given,
+            _guesses(poses, within, ray_model, brick_model, collar_mm),
             all_finite(uv),
-            some.area_px2,
-            poses.area_px2,
-            poses.facing,
-            shift_sd_per_radius=shift_sd,
+            poses.t_camera_brick_mm[:, 2],
             n_pixels=mode.width * mode.height,
             min_leds=MIN_INLIERS,
         )
@@ -270,15 +284,18 @@ def verify(
             np.where(known[:, None], poses.t_camera_brick_mm[rows], t[rows]),
         )
 
-    poses, evidence = fit(np.arange(n), uv, R, t)
+    poses = fit(np.arange(n), uv, R, t)
     for _ in range(_MAX_BAD):
         length, bad = _beyond(uv, poses, gate)
         rows = np.flatnonzero(bad.any(axis=1))
         if rows.size == 0:
             break
         uv[rows, np.where(bad[rows], length[rows], -1.0).argmax(axis=1)] = np.nan
-        again, new = fit(rows, uv[rows], *start(rows))
-        poses, evidence = poses.replaced(rows, again), evidence.replaced(rows, new)
+        poses = poses.replaced(rows, fit(rows, uv[rows], *start(rows)))
+    if intruders or weighed:
+        evidence = weigh(np.arange(n), uv, poses)
+    else:
+        evidence = Evidence(np.full(n, np.nan), np.zeros(n, dtype=bool))
     for _ in range(_MAX_INTRUDERS if intruders else 0):
         best = np.full(int(picture.max(initial=0)) + 1, -np.inf)
         np.maximum.at(best, picture, evidence.log_ratio)
@@ -289,14 +306,16 @@ def verify(
             break
         tried = uv[rows[row]]
         tried[np.arange(len(row)), led] = np.nan
-        without, new = fit(rows[row], tried, *start(rows[row]))
+        pose = ~in_line(all_finite(tried), brick_model)
+        row, tried = row[pose], tried[pose]
+        if row.size == 0:
+            break
+        without = fit(rows[row], tried, *start(rows[row]))
+        new = weigh(rows[row], tried, without)
         gain = new.log_ratio - evidence.log_ratio[rows[row]]
         order = np.lexsort((-gain, row))
         top = order[np.unique(row[order], return_index=True)[1]]  # the likeliest of each row
-        # Four lights fit a pose by chance all too easily to cost a fifth the benefit of the doubt.
-        n_left = all_finite(tried[top]).sum(axis=1)
-        at_rest = ~new.is_scattered[top] & (n_left > MIN_INLIERS)
-        top = top[gain[top] > np.where(at_rest, -_SURE, 0.0)]
+        top = top[gain[top] > 0]
         if top.size == 0:
             break
         at = rows[row[top]]
@@ -305,7 +324,53 @@ def verify(
     _, bad = _beyond(uv, poses, gate)
     kept = np.asarray(all_finite(uv) & ~bad.any(axis=1, keepdims=True))
     kept[kept.sum(axis=1) < MIN_INLIERS] = False
-    return Verified(kept, poses, np.where(kept.any(axis=1), evidence.log_ratio, -np.inf))
+    return Verified(
+        kept, poses, np.where(kept.any(axis=1), evidence.log_ratio, -np.inf), evidence.is_scattered
+    )
+
+
+def _given(
+    lights: LedLights, uv_px: FloatArray, motion: LedMotion | None, n_lights: IntArray, ray_model: RayModel
+) -> Given:
+    within = unknown_motion(uv_px, ray_model) if motion is None else motion
+    return Given(
+        uv_px=uv_px,
+        cov_px2=lights.cov_px2,
+        area_px2=lights.area_px2,
+        is_whole=lights.is_whole,
+        dt_s=within.dt_s,
+        twist_sd=np.tile(UNKNOWN_TWIST_SD, (len(uv_px), 1)) if within.twist_sd is None else within.twist_sd,
+        n_lights=n_lights,
+    )
+
+
+def _guesses(
+    poses: RefinedPoses,
+    motion: LedMotion | None,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    collar_mm: float | None,
+) -> list[Shown]:
+    """Return what poses show by each guess of the profile: one where it was fitted."""
+    R, t_mm = poses.R_camera_brick[:, None], poses.t_camera_brick_mm[:, None]
+    if motion is not None:
+        R, t_mm = R @ matrix_from_rvec(motion.rvec_brick_rad), t_mm + motion.shift_camera_mm
+    posed = all_finite(R, 3) & all_finite(t_mm, 2)
+    R, t_mm = (
+        np.where(posed[:, None, None, None], R, np.eye(3)),
+        np.where(posed[:, None, None], t_mm, _ANY_MM),
+    )
+    wider, collars_mm = 1.0, [collar_mm or 0.0]
+    if collar_mm is None:
+        radius_mm = float(np.median(brick_model.led_radii_mm))
+        wider = _BETWEEN_COLLARS / shift_per_radius(0.0, brick_model)
+        collars_mm = [share * radius_mm for share in _COLLARS]
+    out = []
+    for guess_mm in collars_mm:
+        seen, J = predict_brick(R, t_mm, ray_model, brick_model, collar_mm=guess_mm)
+        places = np.where(posed[:, None, None], seen.uv_px, np.nan)
+        out.append(Shown(places, seen.area_px2, seen.facing, J, wider * seen.model_shift_px))
+    return out
 
 
 def motion_of(motion: LedMotion, rows: IntArray) -> LedMotion:
@@ -323,6 +388,14 @@ def _beyond(uv: FloatArray, poses: RefinedPoses, gate: FloatArray) -> tuple[Floa
     seen = all_finite(uv)
     length = np.where(seen, np.nan_to_num(np.linalg.norm(poses.residual_px, axis=-1), nan=np.inf), 0.0)
     return length, seen & ~((length <= gate) & (poses.facing > MIN_FACING))
+
+
+def in_line(given: BoolArray, brick_model: BrickModel) -> BoolArray:
+    """Tell which sets of LEDs (n, n_leds) stand in one line: they have no pose, whatever fits them."""
+    P = np.where(given[..., None], brick_model.led_positions_mm, 0.0)
+    middle = P.sum(axis=1, keepdims=True) / np.maximum(given.sum(axis=1), 1)[:, None, None]
+    size = np.linalg.svd(np.where(given[..., None], P - middle, 0.0), compute_uv=False)
+    return np.asarray(size[:, 1] <= _SLIM * size[:, 0])
 
 
 def identity_gate_px(radius_px: float) -> float:
