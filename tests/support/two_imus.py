@@ -17,11 +17,16 @@ _FINE_HZ = 4000.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoImus:
-    """One run: ``shake`` holds the relative motion and the optical poses, which the camera's motion leaves."""
+    """One run: ``shake`` holds the relative motion and the optical poses, which the camera's motion leaves.
+
+    The places of the sensors, mm, are those that a user has measured.
+    """
 
     shake: Shake
     brick: ImuTrack
     camera: ImuTrack
+    lever_arm_mm: FloatArray
+    imu_to_camera_mm: FloatArray
 
 
 def simulate_two_imus(
@@ -34,11 +39,14 @@ def simulate_two_imus(
     acc_lag_s: float = -0.0034,
     duration_s: float = 8.0,
     dropouts: tuple[tuple[float, float], ...] = (),
+    gain_sd: float = 0.0,
+    place_sd_mm: float = 0.0,
 ) -> TwoImus:
     """Return a run whose camera is shaken by ``acc_g`` (rms, each axis) at 3-10 Hz and rocked by so much.
 
     The same seed gives the same relative motion, the same optical noise and the same sensor noise. Each
-    sensor stamps later than the camera by its own offset.
+    sensor stamps later than the camera by its own offset. Scale and crossed axes of both are wrong by so much,
+    and their places by so much along each axis.
     """
     shake = simulate_shake(seed, duration_s=duration_s, dropouts=dropouts)
     rng = np.random.default_rng([seed, 5])
@@ -65,6 +73,8 @@ def simulate_two_imus(
     p_brick = p_camera + attitude.apply(1e-3 * (shake.t_mm + relative.apply(LEVER_ARM_MM)))
     p_sensor = p_camera - attitude.apply(1e-3 * IMU_TO_CAMERA_MM)
 
+    wrong = np.random.default_rng([seed, 13])
+
     def sensor(body: Rotation, p: FloatArray, offset_s: float, key: int) -> ImuTrack:
         noise = np.random.default_rng([seed, key])
         acceleration = np.gradient(np.gradient(p, t, axis=0), t, axis=0)
@@ -79,6 +89,8 @@ def simulate_two_imus(
         t_true = np.arange(-0.4 + noise.uniform(0, 0.01), duration_s + 0.4, 0.01)
         gyro_s = gyro(t_true) + noise.normal(0, 0.008, 3) + noise.normal(0, np.radians(0.1), (len(t_true), 3))
         acc_s = acc(t_true - acc_lag_s) + noise.normal(0, 0.15, 3) + noise.normal(0, 0.012, (len(t_true), 3))
+        gyro_s = gyro_s @ (np.eye(3) + gain_sd * wrong.normal(size=(3, 3)))
+        acc_s = acc_s @ (np.eye(3) + gain_sd * wrong.normal(size=(3, 3)))
         lsb = np.radians(1 / 16)
         return ImuTrack(
             t_ns=EPOCH_NS + np.round((t_true + offset_s) * 1e9).astype(np.int64),
@@ -89,5 +101,9 @@ def simulate_two_imus(
         )
 
     return TwoImus(
-        shake, sensor(brick, p_brick, brick_offset_s, 11), sensor(attitude, p_sensor, camera_offset_s, 12)
+        shake=shake,
+        brick=sensor(brick, p_brick, brick_offset_s, 11),
+        camera=sensor(attitude, p_sensor, camera_offset_s, 12),
+        lever_arm_mm=LEVER_ARM_MM + place_sd_mm * wrong.normal(size=3),
+        imu_to_camera_mm=IMU_TO_CAMERA_MM + place_sd_mm * wrong.normal(size=3),
     )
