@@ -130,6 +130,7 @@ def smooth_leds(
         more = (scales / belief.scales)[sights.still.astype(np.int64)]
         use = (done.chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
         stands = np.abs(np.log(scales / belief.scales)).max() < _SCALES_STAND
+        stands = stands and errors.stand_since(belief.errors)
         is_settled = i > _NOISE_CHOSEN_AFTER and stands and np.array_equal(use, done.use)
         if is_settled or i == _PASSES - 1:
             break

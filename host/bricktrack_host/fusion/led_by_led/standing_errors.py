@@ -33,6 +33,7 @@ _SCALE_SD = 5e-5
 centroid inwards by some 0.02 px at 400 px from the centre; a lens that warms up does as much."""
 _OFFSET_SDS_PX = np.geomspace(0.005, 1.0, 30)
 """That single LEDs may be off by; any factor is as likely as the next before the run speaks."""
+_STAND_SD = 0.5  # of an error: what is not yet taken out of the motion is not in its covariance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +68,11 @@ class StandingErrors:
         change = (self.value - since.value)[:N_ERRORS]
         gyro, acc = change[:18].reshape(2, 3, 3)
         return SensorErrors(gyro, acc, change[_ARM], self.covariance[:N_ERRORS, :N_ERRORS])
+
+    def stand_since(self, before: "StandingErrors") -> bool:
+        """Return whether they are where they were, as far as can be told."""
+        change = np.abs(self.value - before.value)
+        return bool((change <= _STAND_SD * np.sqrt(np.diag(self.covariance))).all())
 
     def in_picture_px(self, leds: SeenLeds, pictured: Pictured, n_leds: int) -> FloatArray:
         """Return by how much the centroids are off for them, shape (m, 2)."""
