@@ -319,6 +319,7 @@ def run_case(case: Case, *, with_gtsam: bool = False) -> tuple[dict[str, Score],
         )
         scores["GTSAM"] = score(case, *poses)
     errors = pose_errors(result.track, case.R_clean, case.t_clean_mm)
+    from_raw = pose_errors(result.track, case.R_true, case.t_true_mm)
     chi2 = normalised_squares(errors, result.track.covariance)
     turn = normalised_squares(errors[:, :3], result.track.covariance[:, :3, :3])
     drawn = draw_pose_errors(
@@ -333,6 +334,9 @@ def run_case(case: Case, *, with_gtsam: bool = False) -> tuple[dict[str, Score],
         "NEES outside": float(chi2[~case.in_dropout].mean()),
         "NEES inside": float(chi2[case.in_dropout].mean()),
         "of it rotation": float(turn.mean()),
+        "reference error, deg": float(np.degrees(_rms((errors - from_raw)[:, :3].ravel()))),
+        "reference error, mm": _rms((errors - from_raw)[:, 3:].ravel()),
+        "NEES by it as it is": float(normalised_squares(from_raw, result.track.covariance).mean()),
         "share within 95 %": float((chi2 < CHI2_6_95).mean()),
         "runs in their band": float(band.holds(chi2)),
         "independent errors": band.n_independent,
@@ -345,7 +349,7 @@ def run_case(case: Case, *, with_gtsam: bool = False) -> tuple[dict[str, Score],
     return scores, facts
 
 
-def _rms(values: Sequence[float]) -> float:
+def _rms(values: Sequence[float] | FloatArray) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
