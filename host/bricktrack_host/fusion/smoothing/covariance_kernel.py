@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from bricktrack_host.compiled import compiled, compiled_sums
+from bricktrack_host.compiled import compiled, compiled_fast, compiled_sums
 
 N = 22  # states
 M = 9  # moving states: attitude, position, velocity
 SIZE = N * N  # of a matrix of states
 F_SIZE = M * N  # of a transition: its moving rows, 22 long
-_OFFSET, _SKEW = 18, 19
+_HALF = N // 2  # so many rows the compiler writes out, and works on many columns at once
 
 
 @compiled_sums
@@ -89,47 +89,38 @@ def step_back(F: Any, A: Any, dt: float, width: int) -> None:
 
 
 @compiled_sums
-def rows_times(rows: Any, n: int, reach: int, A: Any, out: Any) -> None:
-    """Write ``n`` rows times a matrix; of a row, the first ``reach`` states and the clocks are not zero.
-
-    ``reach`` is a multiple of three.
-    """
+def rows_times(rows: Any, n: int, A: Any, out: Any) -> None:
+    """Write ``n`` rows times a matrix."""
     for i in range(n):
-        o = i * N
-        offset, skew = rows[o + _OFFSET], rows[o + _SKEW]
-        if reach > _OFFSET:
-            for j in range(N):
-                out[o + j] = rows[o + 21] * A[21 * N + j]
-        else:
-            for j in range(N):
-                out[o + j] = offset * A[_OFFSET * N + j] + skew * A[_SKEW * N + j]
-        for m in range(0, reach, 3):
-            a, b, c, at = rows[o + m], rows[o + m + 1], rows[o + m + 2], m * N
-            for j in range(N):
-                out[o + j] += a * A[at + j] + b * A[at + N + j] + c * A[at + 2 * N + j]
+        row = i * N
+        for j in range(N):
+            total = 0.0
+            for m in range(N):
+                total += rows[row + m] * A[m * N + j]
+            out[row + j] = total
 
 
-@compiled_sums
+@compiled_fast
 def dot(a: Any, i: int, b: Any, j: int) -> float:
-    """Return the product of row i of one matrix and row j of another, two sums at a time."""
+    """Return the product of row i of one matrix and row j of another."""
     i, j = i * N, j * N
-    even, odd = 0.0, 0.0
-    for m in range(0, N, 2):
-        even += a[i + m] * b[j + m]
-        odd += a[i + m + 1] * b[j + m + 1]
-    return even + odd
+    total = 0.0
+    for m in range(N):
+        total += a[i + m] * b[j + m]
+    return float(total)
 
 
 @compiled_sums
 def take_off(A: Any, left: Any, right: Any, n: int) -> None:
     """Replace a matrix by A - left^T right, of ``n`` rows each, an even number."""
     for m in range(0, n, 2):
-        o = m * N
-        for i in range(N):
-            a, b = left[o + i], left[o + N + i]
-            if a != 0.0 or b != 0.0:
-                for j in range(N):
-                    A[i * N + j] -= a * right[o + j] + b * right[o + N + j]
+        row = m * N
+        for half in range(2):
+            first, top = row + half * _HALF, half * _HALF * N
+            for j in range(N):
+                a, b = right[row + j], right[row + N + j]
+                for i in range(_HALF):
+                    A[top + i * N + j] -= left[first + i] * a + left[first + N + i] * b
 
 
 @compiled_sums

@@ -12,9 +12,6 @@ from bricktrack_host.compiled import compiled, compiled_sums
 from bricktrack_host.fusion.inertial.rotation_kernel import turn_by, write_rotation_vector
 from bricktrack_host.fusion.smoothing.covariance_kernel import N
 
-POSE_REACH, LED_REACH = 6, 18
-"""How many of the first states a pose, or an LED, depends on; and on offset and skew."""
-
 
 class LedArrays(NamedTuple):
     """LEDs as seen, each tied to the node nearest in time; ordered by run and node, m in all.

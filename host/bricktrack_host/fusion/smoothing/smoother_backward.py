@@ -25,7 +25,7 @@ from bricktrack_host.fusion.smoothing.covariance_kernel import (
     take_off,
     transpose,
 )
-from bricktrack_host.fusion.smoothing.observation_kernel import LED_REACH, observation_room, place_led
+from bricktrack_host.fusion.smoothing.observation_kernel import observation_room, place_led
 from bricktrack_host.fusion.smoothing.smoother_kernel import (
     CHUNK,
     Kept,
@@ -38,7 +38,6 @@ from bricktrack_host.fusion.smoothing.smoother_kernel import (
 from bricktrack_host.fusion.smoothing.transition_kernel import RunArrays, transition
 
 _WHOLE_EVERY = 16  # nodes: biases and gravity are as unsure at the next
-_ALL = 21  # reach of rows without zeros
 
 
 @compiled_sums
@@ -57,11 +56,11 @@ def _before_measurement(kept: Kept, m: int, gradient: Any, hessian: Any, work: A
     for i in range(n):
         for j in range(N):
             gradient[j] -= work[i] * H[i * N + j]
-    rows_times(HP, n, _ALL, hessian, work)
+    rows_times(HP, n, hessian, work)
     take_off(hessian, H, work, n)
     transpose(hessian)
     # H^T S^-1 H comes in with the second side: there A^T is what is taken off.
-    rows_times(HP, n, _ALL, hessian, work)
+    rows_times(HP, n, hessian, work)
     for j in range(n * N):
         work[j] -= H[j]
     take_off(hessian, H, work, n)
@@ -80,7 +79,7 @@ def _before_step(F: Any, dt: float, gradient: Any, hessian: Any) -> None:
 @compiled_sums
 def _smoothed(rows: Any, n: int, hessian: Any, work: Any, out: Any) -> None:
     """Write what later frames take from a covariance: rows hessian rows^T, for ``n`` rows of P, or of H P."""
-    rows_times(rows, n, _ALL, hessian, work)
+    rows_times(rows, n, hessian, work)
     for r in range(n):
         for j in range(r + 1):
             out[r, j] = out[j, r] = dot(work, r, rows, j)
@@ -90,10 +89,11 @@ def _smoothed(rows: Any, n: int, hessian: Any, work: Any, out: Any) -> None:
 def _write_state(kept: Kept, i: int, gradient: Any, dx: Any, R: Any, x: Any) -> None:
     """Write the smoothed state of node ``i`` of a stretch."""
     P = kept.P[i]
-    dx[:] = 0.0
-    for j in range(N):
-        for r in range(N):
-            dx[r] -= P[j * N + r] * gradient[j]
+    for r in range(N):
+        total = 0.0
+        for j in range(N):
+            total -= P[j * N + r] * gradient[j]
+        dx[r] = total
     copy_state(kept.R[i], kept.x[i], R, x)
     turn_by(R, dx)
     for r in range(3, N):
@@ -132,7 +132,7 @@ def _write_covariance(P: Any, hessian: Any, of: IntArray, rows: Any, work: Any, 
 @compiled_sums
 def _write_variance(P: Any, hessian: Any, work: Any, out: Any) -> None:
     """Write the smoothed variance of every state, shape (22,)."""
-    rows_times(P, N, _ALL, hessian, work)
+    rows_times(P, N, hessian, work)
     for r in range(N):
         out[r] = _left_of(P, r, dot(work, r, P, r))
 
@@ -194,7 +194,7 @@ def backward_pass(
                     leds, led, R_out[k], x_out[k], run.arm_m, run.bg_lin, run.off_lin, run.tau_lin,
                     run.skew_lin, H, led_residual_px[led], observation,
                 )  # fmt: skip
-                rows_times(H, 2, LED_REACH, kept.P[i], HP)
+                rows_times(H, 2, kept.P[i], HP)
                 _smoothed(HP, 2, hessian, work, taken)
                 for r in range(2):
                     for j in range(2):

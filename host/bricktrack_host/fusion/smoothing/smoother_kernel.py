@@ -23,8 +23,6 @@ from bricktrack_host.fusion.smoothing.covariance_kernel import (
     whiten_rows,
 )
 from bricktrack_host.fusion.smoothing.observation_kernel import (
-    LED_REACH,
-    POSE_REACH,
     ObservationRoom,
     observation_room,
     observe_pose,
@@ -119,9 +117,7 @@ def measurements_of(run: RunArrays, start: int, stop: int) -> int:
 
 
 @compiled_sums
-def _correct(
-    C: Any, n: int, reach: int, chi2_95: float, R: Any, x: Any, P: Any, room: Room, kept: Kept, m: int
-) -> Any:
+def _correct(C: Any, n: int, chi2_95: float, R: Any, x: Any, P: Any, room: Room, kept: Kept, m: int) -> Any:
     """Take in ``n`` residuals with their Jacobian, as in ``room``, and covariance C, in place.
 
     Returns the innovation squared over its covariance, its log-determinant, and by how much C was enlarged: a
@@ -131,7 +127,7 @@ def _correct(
     H, HP, y, white, predicted, S, dx = (
         room.H, room.HP, room.y, room.white, room.predicted, room.S, room.dx,
     )  # fmt: skip
-    rows_times(H, n, reach, P, HP)
+    rows_times(H, n, P, HP)
     for i in range(n):
         for j in range(i + 1):
             predicted[i, j] = dot(HP, i, H, j)
@@ -198,9 +194,7 @@ def take_in(
             R, x, w, run.camera_omega_radps[k], run.arm_m, since, ahead, run.R_seen[k], run.p_seen_m[k],
             room.H, room.y, room.observation,
         )  # fmt: skip
-        nis[k], log_det, inflation[k] = _correct(
-            run.cov_seen[k], 6, POSE_REACH, CHI2_6_95, R, x, P, room, kept, m
-        )
+        nis[k], log_det, inflation[k] = _correct(run.cov_seen[k], 6, CHI2_6_95, R, x, P, room, kept, m)
         log_likelihood -= 0.5 * (log_det + min(nis[k], NIS_CAP))
         n += 1
     for i in range(leds.first[k, 0], leds.first[k + 1, 0]):
@@ -209,9 +203,7 @@ def take_in(
                 leds, i, R, x, run.arm_m, run.bg_lin, run.off_lin, run.tau_lin, run.skew_lin,
                 room.H, room.y, room.observation,
             )  # fmt: skip
-            far, log_det, enlarged = _correct(
-                leds.cov_px2[i], 2, LED_REACH, CHI2_2_95, R, x, P, room, kept, m + n
-            )
+            far, log_det, enlarged = _correct(leds.cov_px2[i], 2, CHI2_2_95, R, x, P, room, kept, m + n)
             leds.nis[i], leds.inflation[i] = far, enlarged
             log_likelihood -= 0.5 * (log_det + min(far, NIS_CAP))
             n += 1
