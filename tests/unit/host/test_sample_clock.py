@@ -44,6 +44,21 @@ def test_the_chips_clock_is_found_however_late_the_reads(seed, clock_ppm, late_s
     assert (np.abs(off_ms) < 0.6).mean() > 0.98
 
 
+def test_the_chips_clock_is_found_within_a_vibration():
+    run = simulate_run(5, duration_s=10.0, clock_ppm=6000.0)
+    at_s = (true_sample_ns(run) - EPOCH_NS) * 1e-9
+    buzz = np.sin(2 * np.pi * 44.5 * at_s)[:, None]
+    imu = replace(
+        run.imu,
+        acc_mps2=run.imu.acc_mps2 + 4.0 * buzz * [0.5, 1.0, -0.7],
+        gyro_radps=run.imu.gyro_radps + 0.02 * buzz * [1.0, -0.5, 0.3],
+    )
+    clock = align_times(solve_poses(run.observations, run.camera, run.brick), imu).sample_clock
+    assert clock is not None
+    off_ms = (clock.restamp(imu).t_ns - true_sample_ns(run)) * 1e-6
+    assert (np.abs(off_ms - np.median(off_ms)) < 0.6).mean() > 0.98
+
+
 def test_a_clock_that_does_not_beat_is_not_invented():
     run = simulate_run(5, duration_s=8.0, clock_ppm=20.0)
     assert found(run).sample_clock is None
