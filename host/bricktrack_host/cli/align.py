@@ -281,11 +281,10 @@ def _say(name: str, report: "AlignmentReport", chip: "dict[str, float | None]", 
     if is_told:
         table.add_row("rate of the two clocks", with_sd("skew_ppm", "skew_sd_ppm", "ppm", 1))
     table.add_row("as the stamps have it", with_sd("stamps_offset_ms", "stamps_offset_sd_ms", "ms", 1))
-    if f["sensor_clock_ppm"] is not None:
-        table.add_row(
-            "the sensor's own clock",
-            f"{f['sensor_clock_ppm']:.0f} ppm slow, {f['samples_not_read']} samples not read",
-        )
+    clock_ppm = f["sensor_clock_ppm"]
+    if isinstance(clock_ppm, float):
+        by = f"{abs(clock_ppm):.0f} ppm {'slow' if clock_ppm > 0 else 'fast'}"
+        table.add_row("the sensor's own clock", f"{by}, {f['samples_not_read']} samples not read")
     if f["correlation"] is not None:
         table.add_row("correlation of angular speeds", f"{f['correlation']:.3f}")
     if report.mount is not None:
