@@ -181,7 +181,8 @@ def process_side_by_side(
             key = job.input_sha256()
         except BricktrackError as e:
             n_failed += 1
-            say_error(f"{run}: {e}")
+            words = str(e)
+            say_error(words if words.startswith(f"{run}") else f"{run}: {words}")
             continue
         if not again and is_processed(job, key):
             standing.append(job)

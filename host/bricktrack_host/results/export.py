@@ -37,7 +37,9 @@ def read_run_table(results: Path, table: str) -> "pa.Table":
     name = "fused" if table == "samples" else table
     path = results / f"{name}.parquet"
     if not path.is_file():
-        raise RunFormatError(f"{path}: no such table. Is the run processed, and has it any {name}?")
+        raise RunFormatError(
+            f"{path}: no such table. Process the run first; one without '{name}' leaves it out"
+        )
     whole = read_parquet(path)
     if table != "samples":
         return whole
