@@ -256,6 +256,9 @@ def identities(n: int, seed: int, brick: BrickModel, camera: TrueCamera) -> None
     print(f"  the false ones mirror images   {found}", flush=True)
     found = searched(few, 2, poses, unfitted, camera, rays, rng, fitted=False)
     print(f"  2 hidden, profile not fitted   {found}", flush=True)
+    for name, mm_s in (("0.03 m/s", 30.0), ("0.3 m/s", 300.0)):
+        found = searched(few, 2, poses, domes, camera, rays, rng, speed_mm_s=mm_s)
+        print(f"  2 hidden, {name:10s}           {found}", flush=True)
     for name, speed in (("at rest", 0.0), ("0.03 m/s", 0.1), ("0.09 m/s", 0.3), ("0.3 m/s", 1.0)):
         print(f"run, 1 or 2 hidden, {name:10s}   {tracked(few, domes, camera, rays, rng, speed_share=speed)}")
 

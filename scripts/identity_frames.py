@@ -131,6 +131,26 @@ def mirrored(
     return uv[camera.sees(uv)][:N_FALSE]
 
 
+def read_out(
+    R: FloatArray,
+    t: FloatArray,
+    speed_mm_s: float,
+    brick: BrickModel,
+    camera: TrueCamera,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Return poses when each LED's own row is read, (n, n_leds, 3, 3) and (n, n_leds, 3), of bricks at speed."""
+    velocity = rng.normal(size=(len(R), 1, 3))
+    velocity *= speed_mm_s / np.linalg.norm(velocity, axis=-1, keepdims=True)
+    led_s = np.zeros((len(R), brick.n_leds, 1))
+    P = np.einsum("nij,lj->nli", R, brick.led_positions_mm)
+    for _ in range(10):
+        at_led = t[:, None] + velocity * led_s
+        v = camera.project(P + at_led)[..., 1:]
+        led_s = (v - 0.5 * (camera.mode.height - 1)) * camera.mode.line_time_ns * 1e-9
+    return np.repeat(R[:, None], brick.n_leds, axis=1), at_led
+
+
 def searched(
     n: int,
     n_hidden: int,
@@ -143,14 +163,16 @@ def searched(
     noise_px: float = 0.05,
     mirrors: bool = False,
     fitted: bool = True,
+    speed_mm_s: float = 0.0,
 ) -> Outcome:
-    """Identify frames from nothing, each for itself."""
+    """Identify frames from nothing, each for itself; at a speed, the brick moves within each some other way."""
     out = Outcome()
     while n > 0:
         m = min(n, _CHUNK)
         n -= m
         R, t = poses(m)
-        uv, area = lights_of(R, t, brick, camera, noise_px, rng)
+        shown_at = read_out(R, t, speed_mm_s, brick, camera, rng) if speed_mm_s else (R, t)
+        uv, area = lights_of(*shown_at, brick, camera, noise_px, rng)
         frames = []
         for i in range(m):
             shown = np.sort(rng.permutation(brick.n_leds)[n_hidden:])
