@@ -11,7 +11,9 @@ from bricktrack_common.arrays import rows_of
 from bricktrack_host.fusion.clocks.slip_search import find_slips
 from bricktrack_host.fusion.clocks.stamp_slips import StampSlip, mend
 from bricktrack_host.fusion.clocks.time_alignment import align_times
-from bricktrack_host.quality import PoseFlag
+from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.stages.clocks import with_stamps_mended
+from bricktrack_host.tracks import LedObservations
 
 DROPOUT = (4.0, 4.4)
 PRIOR_NS = 5e6
@@ -137,3 +139,31 @@ def test_frames_at_rest_are_kept_where_the_place_is_in_doubt(shake):
     assert np.flatnonzero(found.sd_ns).size >= 6
     assert found.sd_ns[6:14].max() == pytest.approx(1e9 / 30.0058)
     assert found.left_out.sum() <= 2  # the copy that a slip without a hole means, and one pose in a thousand
+
+
+def test_the_leds_of_frames_without_an_instant_are_taken_out_and_stamps_moved(shake):
+    optical = rows_of(shake.optical, slice(40))
+    late = np.where(np.arange(40) < 20, 0, 1)
+    found = mend(
+        optical, [StampSlip(20, 20, 20, 1)], late,
+        period_ns=1e9 / 30.0058, is_side_told=True, alignment=align_times(shake.optical, shake.imu),
+    )  # fmt: skip
+    read_out_ns = optical.t_ns - 9_000_000
+    seen = LedObservations(
+        sensor_timestamp_ns=read_out_ns,
+        exposure_ns=np.full(40, 2_000_000),
+        uv_px=np.ones((40, 7, 2)),
+        cov_px2=np.tile(np.eye(2), (40, 7, 1, 1)),
+        area_px2=np.ones((40, 7)),
+        led_flags=np.zeros((40, 7), dtype=np.int64),
+        frame_flags=np.zeros(40, dtype=np.int64),
+    )
+    mended = with_stamps_mended(seen, found, optical.t_ns)
+    # Frame 20 is a copy of frame 19: half-way to the next, and without LEDs.
+    assert np.flatnonzero(np.isnan(mended.uv_px).any(axis=(1, 2))).tolist() == [20]
+    assert (mended.led_flags[20] == int(LedFlag.MISSING)).all()
+    moved_ns = mended.sensor_timestamp_ns - read_out_ns
+    assert not moved_ns[:20].any()
+    np.testing.assert_allclose(moved_ns[21:], -1e9 / 30.0058, atol=1)
+    assert read_out_ns[19] < mended.sensor_timestamp_ns[20] < mended.sensor_timestamp_ns[21]
+    assert np.flatnonzero(mended.frame_flags).tolist() == [*range(20, 40)]
