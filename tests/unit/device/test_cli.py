@@ -44,7 +44,11 @@ def test_importing_the_command_line_stays_small() -> None:
 
 
 def test_the_simulated_unit_passes_its_own_check(tmp_path: Path) -> None:
-    done = bricktrackd("check", "--backend", "sim", "--storage", str(tmp_path), "--port", "0", "--json")
+    # Ten frames a second are rendered and encoded in time on a busy machine as well.
+    config = tmp_path / "bricktrackd.toml"
+    config.write_text("[camera]\nframe_rate_hz = 10.0\n")
+    where = ("--config", str(config), "--storage", str(tmp_path), "--port", "0")
+    done = bricktrackd("check", "--backend", "sim", *where, "--json")
     assert done.returncode == 0, done.stdout + done.stderr
 
 
