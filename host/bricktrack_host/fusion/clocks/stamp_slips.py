@@ -94,13 +94,13 @@ class StampSlips:
     def words(self) -> list[str]:
         """Return what happened, a line for each slip, and what was done."""
         right = (
-            "which ones were right the clocks of camera and IMU tell"
+            "the offset of the two clocks tells which ones were right"
             if self.is_side_told
-            else "which ones were right nothing tells, so those before the first slip were kept"
+            else "nothing tells which ones were right, so those before the first slip were kept"
         )
         n, n_out = int(np.count_nonzero(self.late_periods)), int(np.count_nonzero(self.left_out))
         stamps = _number(n, "frame stamp")
-        done = f"{stamps} mended by whole periods, as the turns of camera and gyro ask: {right}"
+        done = f"{stamps} mended by whole periods, as the turns that camera and gyro saw ask; {right}"
         out = f"; {_number(n_out, 'frame')} in between left out" if n_out else ""
         return [*(self._slip_words(slip) for slip in self.slips), done + out]
 
@@ -115,7 +115,7 @@ class StampSlips:
         if slip.late_periods < 0:
             side, cause = "early", f"{_number(n, 'picture')} lost and not counted"
         else:
-            side, cause = "late", f"{_number(n, 'picture')} there once more, or skipped by the stamps alone"
+            side, cause = "late", f"{_number(n, 'picture')} there twice, or skipped by the stamps alone"
         return f"frame stamps slip: {place} they come {by} too {side}; {cause}"
 
 
