@@ -13,7 +13,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.poses import Pose
-from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
+from bricktrack_common.rotations import matrix_from_rvec, skew
 from bricktrack_host.calibration.rays.central_rays import CentralRays
 from bricktrack_host.calibration.rays.irt import TwoPlaneIrt
 
@@ -30,7 +30,7 @@ class RayErrors:
     Attributes
     ----------
     about : Pose
-        Of the brick in the camera frame, about which the errors were taken.
+        Of the brick in the camera frame, about which the errors were taken: at rest, where it was.
     factor : ndarray, shape (6, m)
         ``A`` there, of ``[dtheta rad, dt mm]``: ``R_true = R Exp(dtheta)``, ``t_true = t + dt``.
     slopes : ndarray, shape (6, 6, m)
@@ -42,16 +42,44 @@ class RayErrors:
     factor: FloatArray
     slopes: FloatArray
 
-    def at(self, pose: Pose) -> FloatArray:
-        """Return ``A``, shape (n, 6, m), at poses (n,) of the brick in the camera frame."""
-        turn = rvec_from_matrix(self.about.R.T @ pose.R)
-        away = np.concatenate([turn, pose.t_mm - self.about.t_mm], axis=1)
-        return np.asarray(self.factor + np.einsum("ni,ijm->njm", away, self.slopes))
-
     def covariance(self, pose: Pose) -> FloatArray:
         """Return the covariance, shape (n, 6, 6), of ``[dtheta rad, dt mm]`` of poses (n,); NaN of NaN."""
-        A = self.at(pose)
-        return np.asarray(A @ np.swapaxes(A, 1, 2))
+        way = self._way_to(pose)
+        return _sum_of_factors(
+            np.concatenate([np.ones((len(way), 1)), way], axis=1),
+            np.concatenate([self.factor[None], self.slopes]),
+        )
+
+    def covariance_from_there(self, pose: Pose) -> FloatArray:
+        """Return the covariance, shape (n, 6, 6), of ``[dtheta rad, dt mm]`` of poses seen from `about`.
+
+        Both ends err alike but for the slopes, and for what an attitude that is off does to the way between:
+        ``D = X_about^-1 X`` to first order of the way, see `RestPose.relative_covariance`.
+        """
+        R = self.about.R.T
+        slopes = self.slopes.copy()
+        slopes[:, 3:] = R @ slopes[:, 3:]
+        slopes[:3, :3] += skew(np.eye(3)) @ self.factor[:3]
+        slopes[3:, 3:] += skew(R.T) @ self.factor[:3]
+        return _sum_of_factors(self._way_to(pose), slopes)
+
+    def _way_to(self, pose: Pose) -> FloatArray:
+        """Return the coordinates of the way from `about` to poses, shape (n, 6), to first order."""
+        turned = self.about.R.T @ pose.R
+        turn = [turned[:, k, j] - turned[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
+        return np.concatenate([np.stack(turn, axis=1) / 2, pose.t_mm - self.about.t_mm], axis=1)
+
+
+def _sum_of_factors(weights: FloatArray, factors: FloatArray) -> FloatArray:
+    """Return ``A A^T``, shape (n, 6, 6), of ``A = sum weights[:, i] factors[i]``, factors of shape (c, 6, m).
+
+    Weights of pairs of factors are all that differs from row to row.
+    """
+    i, j = np.triu_indices(len(factors))
+    products = np.einsum("pam,pbm->pab", factors[i], factors[j])
+    products = np.where((i == j)[:, None, None], products, products + np.swapaxes(products, 1, 2))
+    pairs = weights[:, i] * weights[:, j]
+    return np.asarray((pairs @ products.reshape(len(i), 36)).reshape(-1, 6, 6))
 
 
 def ray_errors(rays: CentralRays | TwoPlaneIrt, brick: BrickModel, about: Pose) -> RayErrors | None:

@@ -39,7 +39,7 @@ class RestPose:
     source : "found" or "given"
         Whether the interval was found by stillness or told.
     ray_errors : RayErrors or None
-        What the covariance of the run's poses holds of its calibration's rays.
+        What the covariance of the run's poses holds of its calibration's rays, taken about this pose.
     """
 
     R_camera_rest: FloatArray
@@ -93,11 +93,9 @@ class RestPose:
         mean = np.diag(np.concatenate([self.spread_rad, self.spread_mm]) ** 2) / self.n_frames
         total = of_rest @ mean @ np.swapaxes(of_rest, 1, 2)
         if self.ray_errors is not None:
-            A = self.ray_errors.at(Pose(R_camera_brick, t_camera_brick_mm))
-            at_rest = self.ray_errors.at(Pose(self.R_camera_rest[None], self.t_camera_rest_mm[None]))
-            covariance = covariance - A @ np.swapaxes(A, 1, 2)
-            left = of_pose @ A + of_rest @ at_rest
-            total += left @ np.swapaxes(left, 1, 2)
+            pose = Pose(R_camera_brick, t_camera_brick_mm)
+            covariance = covariance - self.ray_errors.covariance(pose)
+            total += self.ray_errors.covariance_from_there(pose)
         return np.asarray(total + of_pose @ covariance @ of_pose.T)
 
 
