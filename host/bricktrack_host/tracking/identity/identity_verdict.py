@@ -23,7 +23,7 @@ from bricktrack_host.tracking.identity.verification import (
 from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracking.pose.refine import LedMotion, RefinedPoses
 
-_RIVAL = 5.0  # log odds, 150 to one, of an answer against one with other lights
+_RIVAL = 4.6  # log odds, 100 to one, of an answer against one with other lights
 _LED = 7.0  # 1000 to one, of an LED's light against its being false
 _BESIDE_LINE = 4.0
 """50 to one, of the only LED beside others in one line, which tell so little of where it is that of right
@@ -192,7 +192,7 @@ def _doubtful(
 ) -> BoolArray:
     """Return which LEDs of answers (n, n_leds) other assignments ``of`` the same pictures leave in doubt."""
     own = answer[of]
-    has_other_lights = ((others >= 0) & (own >= 0) & (others != own)).any(axis=1)
+    has_other_lights = ((others >= 0) & (others != own)).any(axis=1)
     margin = np.where(has_other_lights, _RIVAL, np.where(is_in_line, _BESIDE_LINE, _LED))
     near = (own >= 0).any(axis=1) & (others_evidence > log_evidence[of] - margin)
     out = np.zeros(answer.shape, dtype=bool)
