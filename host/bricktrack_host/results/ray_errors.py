@@ -42,16 +42,22 @@ class RayErrors:
     factor: FloatArray
     slopes: FloatArray
 
-    def covariance(self, pose: Pose) -> FloatArray:
-        """Return the covariance, shape (n, 6, 6), of ``[dtheta rad, dt mm]`` of poses (n,); NaN of NaN."""
-        way = self._way_to(pose)
+    def covariance(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> FloatArray:
+        """Return the covariance, shape (n, 6, 6), of ``[dtheta rad, dt mm]`` of n poses; NaN of NaN.
+
+        Parameters
+        ----------
+        R_camera_brick : ndarray, shape (n, 3, 3)
+        t_camera_brick_mm : ndarray, shape (n, 3), mm
+        """
+        way = self._way_to(R_camera_brick, t_camera_brick_mm)
         return _sum_of_factors(
             np.concatenate([np.ones((len(way), 1)), way], axis=1),
             np.concatenate([self.factor[None], self.slopes]),
         )
 
-    def covariance_from_there(self, pose: Pose) -> FloatArray:
-        """Return the covariance, shape (n, 6, 6), of ``[dtheta rad, dt mm]`` of poses seen from `about`.
+    def covariance_from_there(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> FloatArray:
+        """Return the covariance, shape (n, 6, 6), of ``[dtheta rad, dt mm]`` of n poses seen from `about`.
 
         Both ends err alike but for the slopes, and for what an attitude that is off does to the way between:
         ``D = X_about^-1 X`` to first order of the way, see `RestPose.relative_covariance`.
@@ -61,13 +67,13 @@ class RayErrors:
         slopes[:, 3:] = R @ slopes[:, 3:]
         slopes[:3, :3] += skew(np.eye(3)) @ self.factor[:3]
         slopes[3:, 3:] += skew(R.T) @ self.factor[:3]
-        return _sum_of_factors(self._way_to(pose), slopes)
+        return _sum_of_factors(self._way_to(R_camera_brick, t_camera_brick_mm), slopes)
 
-    def _way_to(self, pose: Pose) -> FloatArray:
+    def _way_to(self, R: FloatArray, t_mm: FloatArray) -> FloatArray:
         """Return the coordinates of the way from `about` to poses, shape (n, 6), to first order."""
-        turned = self.about.R.T @ pose.R
+        turned = self.about.R.T @ R
         turn = [turned[:, k, j] - turned[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
-        return np.concatenate([np.stack(turn, axis=1) / 2, pose.t_mm - self.about.t_mm], axis=1)
+        return np.concatenate([np.stack(turn, axis=1) / 2, t_mm - self.about.t_mm], axis=1)
 
 
 def _sum_of_factors(weights: FloatArray, factors: FloatArray) -> FloatArray:

@@ -82,21 +82,20 @@ class RestPose:
         covariance : ndarray, shape (n, 6, 6)
             Of these poses in the camera frame.
         """
-        relative = self.relative(R_camera_brick, t_camera_brick_mm)
         R_rest_camera = self.R_camera_rest.T
         of_pose = np.zeros((6, 6))
         of_pose[:3, :3], of_pose[3:, 3:] = np.eye(3), R_rest_camera
-        of_rest = np.zeros((len(relative.R), 6, 6))
-        of_rest[:, :3, :3] = -np.swapaxes(relative.R, 1, 2)
-        of_rest[:, 3:, :3] = skew(relative.t_mm)
+        of_rest = np.zeros((len(R_camera_brick), 6, 6))
+        of_rest[:, :3, :3] = -np.swapaxes(R_rest_camera @ R_camera_brick, 1, 2)
+        of_rest[:, 3:, :3] = skew((t_camera_brick_mm - self.t_camera_rest_mm) @ R_rest_camera.T)
         of_rest[:, 3:, 3:] = -R_rest_camera
-        mean = np.diag(np.concatenate([self.spread_rad, self.spread_mm]) ** 2) / self.n_frames
-        total = of_rest @ mean @ np.swapaxes(of_rest, 1, 2)
+        of_rest *= np.concatenate([self.spread_rad, self.spread_mm]) / np.sqrt(self.n_frames)
+        total = of_rest @ np.swapaxes(of_rest, 1, 2)
         if self.ray_errors is not None:
-            pose = Pose(R_camera_brick, t_camera_brick_mm)
-            covariance = covariance - self.ray_errors.covariance(pose)
-            total += self.ray_errors.covariance_from_there(pose)
-        return np.asarray(total + of_pose @ covariance @ of_pose.T)
+            covariance = covariance - self.ray_errors.covariance(R_camera_brick, t_camera_brick_mm)
+            total += self.ray_errors.covariance_from_there(R_camera_brick, t_camera_brick_mm)
+        half = np.swapaxes((covariance.reshape(-1, 6) @ of_pose.T).reshape(-1, 6, 6), 1, 2)
+        return np.asarray(total + (half.reshape(-1, 6) @ of_pose.T).reshape(-1, 6, 6))
 
 
 def tare(

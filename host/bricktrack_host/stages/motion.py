@@ -8,7 +8,6 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
-from bricktrack_common.poses import Pose
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import BRIDGE_PERIODS, seconds_since
@@ -223,7 +222,7 @@ def with_ray_errors(
         return optical, fused
 
     def of(track: OpticalTrack | FusedTrack) -> FloatArray:
-        return errors.covariance(Pose(track.R_camera_brick, track.t_camera_brick_mm))
+        return errors.covariance(track.R_camera_brick, track.t_camera_brick_mm)
 
     return (
         replace(optical, covariance=optical.covariance + of(optical)),

@@ -111,8 +111,8 @@ def solve_run(
         errors_of_rays = ray_errors(calibration.ray_model, brick, _pose_at_rest(optical, rest))
         if errors_of_rays is None:
             problems.append(
-                "where the brick stood, fewer than four LEDs lie in the picture: the standard deviations hold "
-                "nothing of the calibration's own"
+                "where the brick stood, fewer than four LEDs lie in the picture: the standard deviations "
+                "hold nothing of the calibration's own"
             )
         optical, fused = with_ray_errors(optical, fused, errors_of_rays)
         rest = None if rest is None else replace(rest, ray_errors=errors_of_rays)

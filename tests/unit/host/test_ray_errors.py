@@ -62,7 +62,7 @@ def test_poses_are_as_far_off_as_stated(calibrations):
     for rays, *poses in calibrations:
         errors = ray_errors(rays, LAYOUT, poses[0])
         for pose, truth in zip(poses, (REST, MOVED), strict=True):
-            covariance = errors.covariance(Pose(pose.R[None], pose.t_mm[None]))[0]
+            covariance = errors.covariance(pose.R[None], pose.t_mm[None])[0]
             e = off(pose, truth)
             normalised.append(e @ np.linalg.solve(covariance, e))
     assert np.mean(normalised) / 6 == pytest.approx(1, abs=OF_CHANCE)
@@ -77,7 +77,7 @@ def test_displacements_are_as_far_off_as_stated(calibrations):
             at_rest.R, at_rest.t_mm, (0, 1), 4, np.full(3, 1e-7), np.full(3, 1e-9), "given", errors
         )
         R, t_mm = pose.R[None], pose.t_mm[None]
-        absolute = errors.covariance(Pose(R, t_mm))
+        absolute = errors.covariance(R, t_mm)
         covariance = rest.relative_covariance(R, t_mm, absolute)[0]
         moved = rest.relative(R, t_mm)
         e = off(Pose(moved.R[0], moved.t_mm[0]), true)
