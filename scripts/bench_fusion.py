@@ -13,12 +13,15 @@ import argparse
 import importlib.util
 import itertools
 import logging
+import os
 import resource
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import astuple, dataclass
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before NumPy is loaded
 
 import numpy as np
 from rich.console import Console
