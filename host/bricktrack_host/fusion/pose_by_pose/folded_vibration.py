@@ -10,6 +10,7 @@ stands out of what is usual at frequencies nearby, jumps where they explain far 
 """
 
 import logging
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -149,12 +150,17 @@ class _Fit:
         # Turned about the middle of the run, a beat moves the first and the last jump by a tenth of a turn.
         middle = place + np.round((0.5 * n - place) / beat) * beat
         turn = 0.1 / (phase.frequency_hz * float(np.median(np.diff(self._t_s)))) * 2 * beat / n
-        tried = []
-        for one in beat + turn * np.arange(-16, 17):
-            wave = pulses(phase, one, middle)
-            columns = self._columns(wave)
-            tried.append((float(self._off @ (columns @ np.linalg.lstsq(columns, self._off)[0])), wave))
-        explained, wave = max(tried, key=lambda one: one[0])
+        tried: dict[int, tuple[float, ComplexArray]] = {}
+
+        def likeliest(among: Iterable[int]) -> int:
+            for step in among:
+                wave = pulses(phase, beat + turn * step, middle)
+                columns = self._columns(wave)
+                tried[step] = float(self._off @ (columns @ np.linalg.lstsq(columns, self._off)[0])), wave
+            return max(tried, key=lambda step: tried[step][0])
+
+        near = likeliest(range(-15, 16, 3))
+        explained, wave = tried[likeliest([near - 2, near - 1, near + 1, near + 2])]
         left = (float(self._off @ self._off) - explained) / max(len(self._off) - 6, 1)
         if explained > _JUMPS_EARN * left:
             self._add(wave)
