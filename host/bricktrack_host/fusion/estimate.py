@@ -1,7 +1,7 @@
 """Camera and IMU together: the motion of the brick at any instants, with covariance and flags.
 
-The camera is static and one IMU rides in the brick (DESIGN 8.2). `fuse` treats one run, `fuse_batch` many in
-one loop over time.
+One IMU rides in the brick (DESIGN 8.2); the camera stands still, or a sensor of its own tells how it moves.
+`fuse` treats one run, `fuse_batch` many.
 """
 
 import logging
@@ -39,8 +39,6 @@ from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 logger = logging.getLogger(__name__)
 
 CameraMotionKind = Literal["static", "imu", "table"]
-
-_RUNS_AT_ONCE = 1  # compiled loops gain nothing by more, and each run needs as many passes as it needs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,15 +215,12 @@ def fuse_batch(
     with_forward: bool = False,
     executor: Executor | None = None,
 ) -> list[FusionResult]:
-    """Return what `fuse` gives for each of many runs, eight at once.
+    """Return what `fuse` gives for each of many runs.
 
-    ``executor``: any of `concurrent.futures`, as a pool of processes; the eights are shared out to it.
+    ``executor``: any of `concurrent.futures`, as a pool of processes; the runs are shared out to it.
     """
-    settings = settings or FusionSettings()
-    batches = [inputs[i : i + _RUNS_AT_ONCE] for i in range(0, len(inputs), _RUNS_AT_ONCE)]
-    together = partial(_fuse_together, settings=settings, with_forward=with_forward)
-    done = map(together, batches) if executor is None else executor.map(together, batches)
-    return [result for batch in done for result in batch]
+    of_one = partial(_fuse_one, settings=settings or FusionSettings(), with_forward=with_forward)
+    return list(map(of_one, inputs) if executor is None else executor.map(of_one, inputs))
 
 
 def prepare_run(item: FusionInput, settings: FusionSettings) -> Run:
@@ -281,21 +276,13 @@ def _with_better_clocks(item: FusionInput, run: Run, s: Smoothed, settings: Fusi
     )  # fmt: skip
 
 
-def _fuse_together(
-    inputs: Sequence[FusionInput], settings: FusionSettings, with_forward: bool
-) -> list[FusionResult]:
-    runs = [prepare_run(item, settings) for item in inputs]
-    smoothed = smooth_poses(runs, settings)
-    if any(run.camera is not None for run in runs):
-        runs = [
-            _with_better_clocks(item, run, s, settings)
-            for item, run, s in zip(inputs, runs, smoothed, strict=True)
-        ]
-        smoothed = smooth_poses(runs, settings, levels=[s.levels for s in smoothed])
-    return [
-        fused_result(item, s, settings, with_forward=with_forward)
-        for item, s in zip(inputs, smoothed, strict=True)
-    ]
+def _fuse_one(item: FusionInput, settings: FusionSettings, with_forward: bool) -> FusionResult:
+    run = prepare_run(item, settings)
+    (smoothed,) = smooth_poses([run], settings)
+    if run.camera is not None:
+        run = _with_better_clocks(item, run, smoothed, settings)
+        (smoothed,) = smooth_poses([run], settings, levels=[smoothed.levels])
+    return fused_result(item, smoothed, settings, with_forward=with_forward)
 
 
 def fused_result(
