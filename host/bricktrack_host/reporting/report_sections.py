@@ -264,16 +264,13 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
         known = np.isfinite(g.nees_mean)
         return [f"{g.nees_mean:.2f}", f"{100 * g.nees_within_95:.0f} %"] if known else ["–", "–"]
 
-    rows = [[*cells(g), *honesty(g)] for g in truth.groups]
-    section.tables.append(
-        SectionTable("Camera frame, nothing zeroed", [*head, *names, "NEES/6", "in 95 %"], rows, 2)
-    )
-    if truth.from_rest:
-        section.tables.append(
-            SectionTable(
-                "From rest, brick axes at rest", [*head, *names], [cells(g) for g in truth.from_rest], 2
-            )
-        )
+    for title, groups in (
+        ("Camera frame, nothing zeroed", truth.groups),
+        ("From rest, brick axes at rest", truth.from_rest),
+    ):
+        if groups:
+            rows = [[*cells(g), *honesty(g)] for g in groups]
+            section.tables.append(SectionTable(title, [*head, *names, "NEES/6", "in 95 %"], rows, 2))
     section.figures.append(
         embed_chart(quality_plots.truth_chart(result, figures, truth), "Errors against the truth over time",
                "Band: what the fused covariances promise, 95 %. The tables hold errors beyond the axes.")
