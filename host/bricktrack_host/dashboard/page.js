@@ -9,7 +9,6 @@ window.bricktrack = {
     plan.addEventListener("keydown", (e) => this.go(e));
     plan.addEventListener("focusin", (e) => this.keepTab(e.target.closest(".unit")));
     this.heard();
-    setInterval(() => this.listen(), 500);
   },
   setStates(changes) {
     for (const [name, state, letter] of changes) {
@@ -60,7 +59,7 @@ window.bricktrack = {
   listen() {
     const isLost = Date.now() - this.heardAt > this.SILENT_MS;
     const banner = document.getElementById("lost");
-    if (isLost !== banner.hidden) return;
+    if (isLost !== banner?.hidden) return;
     banner.hidden = !isLost;
     for (const part of document.body.children) part.inert = isLost && part !== banner;
     if (isLost) window.socket.sendBuffer.length = 0;
@@ -70,3 +69,6 @@ window.bricktrack = {
       : "";
   },
 };
+// From the first moment: a server may fall silent before the plan is there.
+window.bricktrack.heardAt = Date.now();
+setInterval(() => window.bricktrack.listen(), 500);
