@@ -24,6 +24,7 @@ from bricktrack_device.sim.bno055_chip import Bno055Chip
 from bricktrack_device.sim.imu_signal import ImuSensors, chip_period_s
 from bricktrack_device.sim.settings import HiddenLed, SimImu, SimSettings
 from bricktrack_device.sim.world import SimWorld
+from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraImu
 from bricktrack_host.tracking.led_model.led_profile import LedPrediction, predict_brick
 from bricktrack_host.tracks import ImuTrack, LedObservations
 
@@ -45,7 +46,10 @@ class _FixedEpoch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DaemonRun:
-    """What a unit recorded, and the world that it was recorded in."""
+    """What a unit recorded, and the world that it was recorded in.
+
+    ``camera_imu``: what moves with the camera, where it does.
+    """
 
     observations: LedObservations
     imu: ImuTrack
@@ -53,6 +57,7 @@ class DaemonRun:
     brick: BrickModel
     world: SimWorld
     stamp_offset_ns: int
+    camera_imu: CameraImu | None = None
 
     def truth(self, t_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return true rotations and positions, mm, at camera times."""
@@ -88,6 +93,9 @@ def simulate_run(
     outlier_share: float = 0.0,
     late_share: float = 0.0,
     standing_px: float | None = None,
+    camera_acc_g: float = 0.0,
+    camera_rocking_deg: float = 0.0,
+    has_camera_imu: bool = False,
 ) -> DaemonRun:
     """Return one run: a second of rest, a shake, a second of rest.
 
@@ -105,6 +113,11 @@ def simulate_run(
     standing_px : float, px, optional
         Standard deviation of an error of each LED that stands still over the run; with it come those of the
         LEDs' profile, as the layout states it, and of the picture's size. Without: none of them.
+    camera_acc_g, camera_rocking_deg : float
+        How the camera's component is shaken and rocked, rms along and about each axis; what the camera sees
+        of the brick stays the same.
+    has_camera_imu : bool
+        Whether a chip is on the camera's component.
     """
     settings = SimSettings(
         seed=seed,
@@ -116,6 +129,8 @@ def simulate_run(
         shake_s=duration_s - 2.0,
         dropouts=list(dropouts),
         hidden_leds=[HiddenLed(name=n, start_s=a, duration_s=d) for n, a, d in hidden_leds],
+        camera_acc_g=camera_acc_g,
+        camera_rocking_deg=camera_rocking_deg,
         imu=SimImu(clock_ppm=clock_ppm),
     )
     world = SimWorld(settings, _FixedEpoch())
@@ -133,8 +148,13 @@ def simulate_run(
         led_profile=ProfileEntry(collar_mm=_COLLAR_MM, source="simulated"),
     )
     observations = _observe(world, camera, brick, rng, duration_s, centroid_sd_px, outlier_share, standing_px)
-    imu = _sample(world, rng, duration_s, stamp_offset_ns, acc_range_g, late_share)
-    return DaemonRun(observations, imu, camera, brick, world, stamp_offset_ns)
+    shared = duration_s, stamp_offset_ns, acc_range_g, late_share
+    imu = _sample(world, rng, *shared, on_camera=False)
+    camera_imu = None
+    if has_camera_imu:
+        samples = _sample(world, np.random.default_rng([seed, 80]), *shared, on_camera=True)
+        camera_imu = CameraImu(samples, -np.array(settings.imu.on_camera_mm))
+    return DaemonRun(observations, imu, camera, brick, world, stamp_offset_ns, camera_imu)
 
 
 def _observe(
@@ -213,9 +233,12 @@ def _sample(
     stamp_offset_ns: int,
     acc_range_g: int,
     late_share: float,
+    *,
+    on_camera: bool,
 ) -> ImuTrack:
-    sensors = ImuSensors(world, on_camera=False, stream=1)
-    chip = Bno055Chip(bytes(16), sensors.measure, period_s=chip_period_s(world.settings, 1))
+    stream = 2 if on_camera else 1
+    sensors = ImuSensors(world, on_camera=on_camera, stream=stream)
+    chip = Bno055Chip(bytes(16), sensors.measure, period_s=chip_period_s(world.settings, stream))
     on_ns = EPOCH_NS - 2_000_000_000
     range_code = {2: 0, 4: 1, 8: 2, 16: 3}[acc_range_g]
     for register, value in (
@@ -227,7 +250,7 @@ def _sample(
         chip.write(register, bytes([value]), on_ns)
     t0_ns = EPOCH_NS - 400_000_000 + round(rng.uniform(0, _PERIOD_NS))
     description = ImuDescription(
-        name="brick",
+        name="camera" if on_camera else "brick",
         chip_id="",
         bus="sim",
         address=0x28,
@@ -238,7 +261,7 @@ def _sample(
         t0_ns=t0_ns,
     )
     records: list[ImuRecord] = []
-    late = np.random.default_rng([world.settings.seed, 78])
+    late = np.random.default_rng([world.settings.seed, 81 if on_camera else 78])
     for slot in range(int((duration_s + 0.8) * 100)):
         # A wake-up is late by some 30 us, now and then by more; a burst takes 1.3 ms, give or take.
         due = t0_ns + slot * _PERIOD_NS

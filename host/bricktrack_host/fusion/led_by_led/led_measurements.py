@@ -11,7 +11,7 @@ from bricktrack_common.rotations import skew
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
-from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, noise_parts
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.smoothing.linearisation import Linearisation
 from bricktrack_host.fusion.smoothing.observation_kernel import LedArrays
 from bricktrack_host.fusion.smoothing.smoother import Estimate, Problem
@@ -179,7 +179,18 @@ def led_arrays(
     dt = t_s - start_s
     J = pictured.J_px.copy()
     J[..., 3:] *= 1e3
-    parts = noise_parts(run.signal, np.sort(np.stack([start_s, t_s]), axis=0), lin, settings)
+    R_lin, t_lin_m, turned = (
+        pictured.R_camera_brick,
+        pictured.t_camera_brick_mm * 1e-3,
+        np.zeros((len(dt), 3)),
+    )
+    felt = np.zeros((len(dt), 2, 3))
+    if run.camera is not None:
+        J[..., 3:] = J[..., 3:] @ np.swapaxes(run.camera.still_attitude(t_s), 1, 2)
+        R_lin, t_lin_m = run.camera.to_still(t_s, R_lin, t_lin_m)
+        turned = run.camera.still_omega_radps(t_s)
+        felt = run.camera.increments(start_s, t_s, acc_lag_s=lin.lag_s)[:, :2]
+    parts = run.noise_parts(np.sort(np.stack([start_s, t_s]), axis=0), lin, settings)
     turn = parts.gyro(levels[0]) * np.abs(dt)
     shift = parts.acc(levels[1]) * np.abs(dt) ** 3 / 3
     between = np.repeat(np.stack([turn, shift], axis=1), 3, axis=1)
@@ -194,8 +205,11 @@ def led_arrays(
         dv_mps=step.dv_mps,
         dp_m=step.dp_m,
         omega_radps=run.signal.gyro_at(t_s),
-        R_lin=pictured.R_camera_brick,
-        t_lin_m=pictured.t_camera_brick_mm * 1e-3,
+        camera_omega_radps=turned,
+        camera_dv_mps=felt[:, 0].copy(),
+        camera_dp_m=felt[:, 1].copy(),
+        R_lin=R_lin,
+        t_lin_m=t_lin_m,
         residual_px=pictured.residual_px,
         J=J,
         cov_px2=cov,

@@ -14,7 +14,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
-from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts, noise_parts
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts
 from bricktrack_host.fusion.smoothing.linearisation import Linearisation
 from bricktrack_host.fusion.smoothing.smoother import Problem, score_noise
 from bricktrack_host.fusion.smoothing.smoother_kernel import NIS_CAP
@@ -126,7 +126,7 @@ def choose_inertial_noise(
 
     @cache
     def parts_of(impact: int) -> NoiseParts:
-        return noise_parts(run.signal, nodes.t_s, lin, InertialNoise(impact=impact).settings(settings))
+        return run.noise_parts(nodes.t_s, lin, InertialNoise(impact=impact).settings(settings))
 
     def score(choice: InertialNoise) -> float:
         parts = parts_of(choice.impact)

@@ -58,7 +58,10 @@ def sample_motion(
     """
     at = _carry(run, nodes, estimate.state, b, output_t_ns, is_smoothed=is_smoothed)
     zero = np.zeros(len(at.t_s))
-    R_out, p_out, H = observe(at.state, at.omega_radps, run.lever_arm_m, at.t_cam_s - run.t_mid_s, zero)
+    camera = None if run.camera is None else run.camera.still_omega_radps(at.t_s)
+    R_out, p_out, H = observe(
+        at.state, at.omega_radps, run.lever_arm_m, at.t_cam_s - run.t_mid_s, zero, camera_omega_radps=camera
+    )
     H = H[..., estimate.of]
     cov = estimate.covariance[at.node, b]
     if is_smoothed:
@@ -103,12 +106,14 @@ def sample_poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Return smoothed rotations and positions, mm, of run ``b`` of a batch at instants of camera time.
 
-    As by `sample_motion`, whether sure or not; NaN beyond the nodes. The camera stands still.
+    As by `sample_motion`, whether sure or not; NaN beyond the nodes.
     """
     at = _carry(run, nodes, states, b, t_ns, is_smoothed=True)
-    R, t_mm = at.state.R, 1e3 * (at.state.x[:, POS] - at.state.R @ run.lever_arm_m)
-    R[at.is_outside], t_mm[at.is_outside] = np.nan, np.nan
-    return R, t_mm
+    R, p_m = at.state.R, at.state.x[:, POS] - at.state.R @ run.lever_arm_m
+    if run.camera is not None:
+        R, p_m = run.camera.from_still(at.t_s, R, p_m)
+    R[at.is_outside], p_m[at.is_outside] = np.nan, np.nan
+    return R, 1e3 * p_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)

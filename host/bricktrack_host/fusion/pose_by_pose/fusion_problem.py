@@ -158,6 +158,11 @@ class Run:
             sensor_covariance=errors.covariance,
         )
 
+    def noise_parts(self, t_s: FloatArray, lin: Linearisation, settings: FusionSettings) -> NoiseParts:
+        """Return how far all sensors are to be trusted over steps between instants of IMU time."""
+        parts = noise_parts(self.signal, t_s, lin, settings)
+        return parts if self.camera is None else parts + camera_noise(self.camera, t_s, lin, settings)
+
     def aligned_s(self) -> FloatArray:
         """Return IMU time of the frames as the alignment had it, shape (n,)."""
         a = self.alignment
@@ -325,11 +330,10 @@ def build_problem(
         pr.R_step[:k, b], pr.R_half[:k, b] = step.R, step.R_half
         pr.dv_mps[:k, b], pr.dp_m[:k, b] = step.dv_mps, step.dp_m
         pr.f_rate_mps3[:k, b], pr.f_curve_mps4[:k, b] = step.f_rate_mps3, step.f_curve_mps4
-        parts.append(noise_parts(run.signal, node.t_s, lin, settings))
+        parts.append(run.noise_parts(node.t_s, lin, settings))
         if run.camera is not None:
             start_s, end_s = node.t_s[:-1], node.t_s[1:]
             pr.known[:k, b] = run.camera.increments(start_s, end_s, acc_lag_s=lin.lag_s)
-            parts[b] = parts[b] + camera_noise(run.camera, node.t_s, lin, settings)
             pr.camera_omega_radps[: k + 1, b] = run.camera.still_omega_radps(node.t_s)
         pr.gyro_var[:k, b], pr.acc_var[:k, b] = parts[b].gyro(levels[b][0]), parts[b].acc(levels[b][1])
         pr.omega_radps[: k + 1, b] = run.signal.gyro_at(node.t_s)

@@ -111,9 +111,18 @@ class CameraMotion:
         self, other: "CameraMotion", t_s: FloatArray, R: FloatArray, p_m: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return poses in still axes by this motion, shape (n, 3, 3) and (n, 3), that were so by another."""
-        between = self.still_attitude(t_s) @ np.swapaxes(other.still_attitude(t_s), 1, 2)
-        arm_m = self.still_attitude(t_s) @ (self.imu_to_camera_m - other.imu_to_camera_m)
-        return between @ R, np.asarray(np.einsum("nij,nj->ni", between, p_m) + arm_m)
+        return self.to_still(t_s, *other.from_still(t_s, R, p_m))
+
+    def to_still(self, t_s: FloatArray, R: FloatArray, p_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return poses that the camera sees, shape (n, 3, 3) and (n, 3), in still axes about its sensor."""
+        still = self.still_attitude(t_s)
+        return still @ R, np.einsum("nij,nj->ni", still, p_m + self.imu_to_camera_m)
+
+    def from_still(self, t_s: FloatArray, R: FloatArray, p_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return poses in still axes, shape (n, 3, 3) and (n, 3), as the camera sees them."""
+        still = self.still_attitude(t_s)
+        seen_m = np.einsum("nji,nj->ni", still, p_m) - self.imu_to_camera_m
+        return np.swapaxes(still, 1, 2) @ R, np.asarray(seen_m)
 
     def own_s(self, t_s: FloatArray) -> FloatArray:
         """Return instants of the brick's IMU as seconds of the camera's."""
@@ -186,14 +195,13 @@ def without_gains(imu: ImuTrack, *, gyro_gain: FloatArray, acc_gain: FloatArray)
 
 def still_track(optical: OpticalTrack, motion: CameraMotion, t_s: FloatArray) -> OpticalTrack:
     """Return the optical poses in still axes, about the camera's IMU; ``t_s`` are the frames' IMU times."""
-    R = motion.still_attitude(t_s)
     turn = np.zeros((len(t_s), 6, 6))
-    turn[:, :3, :3], turn[:, 3:, 3:] = np.eye(3), R
-    from_imu_mm = optical.t_camera_brick_mm + 1e3 * motion.imu_to_camera_m
+    turn[:, :3, :3], turn[:, 3:, 3:] = np.eye(3), motion.still_attitude(t_s)
+    R, p_m = motion.to_still(t_s, optical.R_camera_brick, 1e-3 * optical.t_camera_brick_mm)
     return replace(
         optical,
-        R_camera_brick=R @ optical.R_camera_brick,
-        t_camera_brick_mm=np.einsum("nij,nj->ni", R, from_imu_mm),
+        R_camera_brick=R,
+        t_camera_brick_mm=1e3 * p_m,
         covariance=turn @ optical.covariance @ np.swapaxes(turn, 1, 2),
     )
 

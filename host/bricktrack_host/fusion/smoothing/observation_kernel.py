@@ -28,8 +28,12 @@ class LedArrays(NamedTuple):
         What the inertial samples say of that way, in body axes at the node.
     omega_radps : ndarray, shape (m, 3)
         Measured angular rate at the LED's instant.
+    camera_omega_radps, camera_dv_mps, camera_dp_m : ndarray, shape (m, 3)
+        Angular rate of a camera that moves at that instant, and what its motion adds on that way to velocity
+        and displacement, in still axes; zero of one that stands.
     R_lin, t_lin_m : ndarray, shape (m, 3, 3), (m, 3)
-        Pose of the brick at that instant for which the picture was predicted.
+        Pose of the brick at that instant for which the picture was predicted; of a camera that moves in still
+        axes, as is ``J``.
     residual_px, J, cov_px2 : ndarray, shape (m, 2), (m, 2, 6), (m, 2, 2)
         Seen less predicted; derivative of the prediction by [dtheta rad, dt m] of that pose; covariance.
     nis, inflation : ndarray, shape (m,)
@@ -44,6 +48,9 @@ class LedArrays(NamedTuple):
     dv_mps: FloatArray
     dp_m: FloatArray
     omega_radps: FloatArray
+    camera_omega_radps: FloatArray
+    camera_dv_mps: FloatArray
+    camera_dp_m: FloatArray
     R_lin: FloatArray
     t_lin_m: FloatArray
     residual_px: FloatArray
@@ -144,6 +151,7 @@ def place_led(
     dt, since = leds.dt_s[m], leds.since_mid_s[m]
     half = 0.5 * dt * dt
     step, dv, dp, J = leds.R_step[m], leds.dv_mps[m], leds.dp_m[m], leds.J[m]
+    camera, t_lin = leds.camera_omega_radps[m], leds.t_lin_m[m]
     ahead = (x[18] - tau_lin) + since * (x[19] - skew_lin)
     Ri, w, turn, off, H6 = room.R, room.a, room.b, room.off, room.H6
     for i in range(3):
@@ -154,16 +162,20 @@ def place_led(
     turn_by(Ri, turn)
     swing = turn
     _swing(w, arm, swing)
+    for i in range(3):
+        w[i] -= Ri[0, i] * camera[0] + Ri[1, i] * camera[1] + Ri[2, i] * camera[2]
     moved0 = dp[0] - half * (x[12] - off_lin[0])
     moved1 = dp[1] - half * (x[13] - off_lin[1])
     moved2 = dp[2] - half * (x[14] - off_lin[2])
     for i in range(3):
         v = x[6 + i] + dt * x[15 + i] + R[i, 0] * dv[0] + R[i, 1] * dv[1] + R[i, 2] * dv[2]
         v += Ri[i, 0] * swing[0] + Ri[i, 1] * swing[1] + Ri[i, 2] * swing[2]
-        p = x[3 + i] + dt * x[6 + i] + half * x[15 + i]
+        b, c = (i + 1) % 3, (i + 2) % 3
+        v += leds.camera_dv_mps[m, i] - (camera[b] * t_lin[c] - camera[c] * t_lin[b])
+        p = x[3 + i] + dt * x[6 + i] + half * x[15 + i] + leds.camera_dp_m[m, i]
         p += R[i, 0] * moved0 + R[i, 1] * moved1 + R[i, 2] * moved2
         p -= Ri[i, 0] * arm[0] + Ri[i, 1] * arm[1] + Ri[i, 2] * arm[2]
-        off[3 + i] = p + v * ahead - leds.t_lin_m[m, i]
+        off[3 + i] = p + v * ahead - t_lin[i]
         # -R [dp]x, and R_i [arm]x behind what turns the LED's own attitude.
         a0 = Ri[i, 1] * arm[2] - Ri[i, 2] * arm[1]
         a1 = Ri[i, 2] * arm[0] - Ri[i, 0] * arm[2]

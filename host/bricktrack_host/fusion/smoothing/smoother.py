@@ -357,6 +357,7 @@ def _no_leds(n_nodes: int) -> LedArrays:
         first=np.zeros((n_nodes + 1, 1), dtype=np.int64),
         use=np.zeros(0, dtype=np.bool_),
         dt_s=none, since_mid_s=none, R_step=none33, dv_mps=none3, dp_m=none3, omega_radps=none3,
+        camera_omega_radps=none3, camera_dv_mps=none3, camera_dp_m=none3,
         R_lin=none33, t_lin_m=none3, residual_px=np.empty((0, 2)), J=np.empty((0, 2, 6)),
         cov_px2=np.empty((0, 2, 2)), nis=none, inflation=none,
     )  # fmt: skip
