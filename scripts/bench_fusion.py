@@ -32,12 +32,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
-from bricktrack_host.fusion.believed_errors import (
-    MeanBand,
-    draw_pose_errors,
-    normalised_squares,
-    pose_errors,
-)
+from bricktrack_host.fusion.believed_errors import MeanBand, draw_pose_errors, pose_errors
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.estimate import FusionInput, fuse_batch, fused_result, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
@@ -45,6 +40,7 @@ from bricktrack_host.fusion.inertial.imu_signal import chain_rotations
 from bricktrack_host.fusion.pose_by_pose.fused_output import common_part
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.fusion.smoothing.smoother_kernel import CHI2_6_95
+from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 

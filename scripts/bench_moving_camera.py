@@ -25,11 +25,12 @@ from brick_shakes import EPOCH_NS
 from two_imus import simulate_two_imus
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.fusion.believed_errors import normalised_squares, pose_errors
+from bricktrack_host.fusion.believed_errors import pose_errors
 from bricktrack_host.fusion.estimate import fuse
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraImu
 from bricktrack_host.fusion.smoothing.smoother_kernel import CHI2_6_95
+from bricktrack_host.normalised_errors import normalised_squares
 
 DURATION_S = 15.0
 DROPOUTS = ((2.0, 2.4), (3.6, 3.9), (5.0, 5.5), (8.0, 8.4), (10.2, 10.5), (12.0, 12.5))

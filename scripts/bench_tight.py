@@ -34,17 +34,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 from daemon_runs import DaemonRun, simulate_run
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.fusion.believed_errors import (
-    MeanBand,
-    draw_pose_errors,
-    normalised_squares,
-    pose_errors,
-)
+from bricktrack_host.fusion.believed_errors import MeanBand, draw_pose_errors, pose_errors
 from bricktrack_host.fusion.estimate import FusionInput, fuse
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.pose_by_pose.fused_output import common_part
 from bricktrack_host.fusion.smoothing.smoother_kernel import CHI2_6_95
 from bricktrack_host.fusion.tight import fuse_tight, smooth_both, tight_result
+from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracking.optical_track import solve_poses
 from bricktrack_host.tracking.pose.frame_motion import led_motion

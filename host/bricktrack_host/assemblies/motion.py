@@ -18,6 +18,7 @@ from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.poses import Pose
 from bricktrack_common.rotations import rvec_from_matrix, skew
+from bricktrack_host.normalised_errors import normalised_squares
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,16 +109,13 @@ def disagreement(one: Motion, other: Motion) -> tuple[FloatArray, FloatArray, Fl
         Rotation vector from the second to the first.
     normalised : ndarray, shape (n,)
         Squared difference over the sum of both covariances; 6 on average if both are independent and honest.
+        NaN where either is not known.
     """
     position_mm = one.t_mm - other.t_mm
     rotation_rad = rvec_from_matrix(np.swapaxes(other.R, 1, 2) @ one.R)
     difference = np.concatenate([rotation_rad, position_mm], axis=1)
     total = one.covariance + other.covariance
-    known = np.isfinite(difference).all(axis=1) & np.isfinite(total).all(axis=(1, 2))
-    normalised = np.full(len(difference), np.nan)
-    solved = np.linalg.solve(total[known], difference[known][..., None])[..., 0]
-    normalised[known] = np.einsum("ni,ni->n", difference[known], solved)
-    return position_mm, rotation_rad, normalised
+    return position_mm, rotation_rad, normalised_squares(difference, total)
 
 
 def _through(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.evaluation.sweeps import Sweep
+from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.tracking.pose.finite import all_finite
 
 PAPER_RMS_MM = (0.2296, 0.3943, 0.0703)
@@ -89,7 +90,7 @@ def score_sweep(
         if covariance is not None:
             turn = rvec_from_matrix(np.swapaxes(R_camera_brick[posed], -1, -2) @ sweep.R_camera_brick[posed])
             e = np.hstack([turn, sweep.t_camera_brick_mm[posed] - t_camera_brick_mm[posed]])
-            nees[posed] = np.sum(e * np.linalg.solve(covariance[posed], e[..., None])[..., 0], axis=1)
+            nees[posed] = normalised_squares(e, covariance[posed])
     return SweepScore(sweep, error_mm, error_deg, bound_mm, bound_deg, nees)
 
 

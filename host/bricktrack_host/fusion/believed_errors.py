@@ -70,24 +70,6 @@ def pose_errors(track: FusedTrack, R: FloatArray, t_mm: FloatArray) -> FloatArra
     return np.concatenate([turn, t_mm - track.t_camera_brick_mm], axis=1)
 
 
-def normalised_squares(errors: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return squared errors over their covariance.
-
-    Parameters
-    ----------
-    errors : ndarray, shape (k, d) or (k, d, n_draws)
-    covariance : ndarray, shape (k, d, d)
-
-    Returns
-    -------
-    squares : ndarray, shape (k,) or (k, n_draws)
-        Of d degrees of freedom.
-    """
-    e = errors if errors.ndim == 3 else errors[..., None]
-    squares = (e * np.linalg.solve(covariance, e)).sum(axis=1)
-    return np.asarray(squares if errors.ndim == 3 else squares[:, 0])
-
-
 def draw_pose_errors(
     s: Smoothed, t_ns: IntArray, *, common: FloatArray, n_draws: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:

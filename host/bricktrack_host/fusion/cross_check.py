@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.tracks import FusedTrack
 
 _DISAGREE_CHI2 = 22.5  # of 6 degrees of freedom: one in 1000
@@ -39,8 +40,8 @@ def cross_check(track: FusedTrack, pose_level: FusedTrack) -> CrossCheck:
     turn = rvec_from_matrix(np.swapaxes(pose_level.R_camera_brick[both], 1, 2) @ track.R_camera_brick[both])
     shift = track.t_camera_brick_mm[both] - pose_level.t_camera_brick_mm[both]
     e = np.concatenate([turn, shift], axis=1)
-    chi2 = (e * np.linalg.solve(pose_level.covariance[both], e[..., None])[..., 0]).sum(axis=1)
-    apart = float((chi2 > _DISAGREE_CHI2).mean())
+    allowed = normalised_squares(e, pose_level.covariance[both]) <= _DISAGREE_CHI2
+    apart = float(1.0 - allowed.mean())
     away = np.linalg.norm(shift, axis=1)
     return CrossCheck(
         rms_mm=float(np.sqrt(np.mean(away**2))),

@@ -12,6 +12,7 @@ from scipy.special import chdtri
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.results.result_store import RunResult
@@ -192,7 +193,7 @@ class _Errors:
         return cls(
             error=np.concatenate([shift_mm, np.rad2deg(turn_rad)], axis=1),
             sd=np.concatenate([sd[:, 3:], np.rad2deg(sd[:, :3])], axis=1),
-            nees=_normalised(raw, track.covariance),
+            nees=normalised_squares(raw, track.covariance),
             has_truth=_known(t_true_mm),
             has_pose=_known(track.t_camera_brick_mm),
         )
@@ -220,7 +221,7 @@ def _rest_errors(
     return _Errors(
         error=np.concatenate([moved_mm - true_moved_mm, np.rad2deg(turn_rad)], axis=1),
         sd=np.concatenate([sd[:, 3:], np.rad2deg(sd[:, :3])], axis=1),
-        nees=_normalised(np.concatenate([turn_rad, moved_mm - true_moved_mm], axis=1), covariance),
+        nees=normalised_squares(np.concatenate([turn_rad, moved_mm - true_moved_mm], axis=1), covariance),
         has_truth=_known(t_true_mm),
         has_pose=_known(track.t_camera_brick_mm),
     )
@@ -228,22 +229,6 @@ def _rest_errors(
 
 def _known(vectors: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(vectors).all(axis=1))
-
-
-def _normalised(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return ``e^T C^-1 e``; NaN where an error or covariance is not known or the covariance is singular."""
-    out = np.full(len(error), np.nan)
-    known = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    known &= (scale > 0).all(axis=1)
-    if known.any():
-        e = error[known] / scale[known]  # mm and rad differ by orders: correlations are well conditioned
-        C = covariance[known] / (scale[known][:, :, None] * scale[known][:, None, :])
-        regular = np.linalg.eigvalsh(C)[:, 0] > 1e-9
-        rows = np.flatnonzero(known)[regular]
-        solved = np.linalg.solve(C[regular], e[regular][..., None])[..., 0]
-        out[rows] = np.sum(e[regular] * solved, axis=1)
-    return out
 
 
 def _group_masks(

@@ -11,7 +11,6 @@ from bricktrack_host.fusion.believed_errors import (
     MeanBand,
     draw_pose_errors,
     draw_state_errors,
-    normalised_squares,
     pose_errors,
 )
 from bricktrack_host.fusion.estimate import FusionInput, fused_result, prepare_run
@@ -19,6 +18,7 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.fusion.smoothing.smoother import residuals
 from bricktrack_host.fusion.smoothing.transition_kernel import transition
+from bricktrack_host.normalised_errors import normalised_squares
 
 N_DRAWS = 4000
 
