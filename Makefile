@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-virtual-camera check bench docs format constraints clean help
+.PHONY: setup demo test test-virtual-camera check check-style check-types check-docs bench docs format constraints clean help
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 24
@@ -14,7 +14,7 @@ $(READY): pyproject.toml constraints.txt
 	    { echo "bricktrack needs Python 3.11 or newer; $(PYTHON) is older. Try: make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt \
 	    -e '.[device,sim,host,dashboard,scale,analysis,view]' --group dev
 	@touch $@
 
@@ -30,12 +30,20 @@ test-virtual-camera: $(READY)  ## the picamera2 adapter under the real libraries
 	tests/virtual_pi/run_camera.sh
 
 check: $(READY)  ## formatting, lint, import contracts, types, documentation
+	+@$(MAKE) --no-print-directory --jobs 2 --output-sync=target check-docs check-types check-style
+
+check-style: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
+
+check-types: $(READY)
 	$(BIN)/mypy
+
+# All pages are read and all references resolved; writing them as HTML, which 'make docs' does, takes twice as long.
+check-docs: $(READY)
 	@rm -rf docs/reference/generated
-	$(BIN)/sphinx-build -q -W -b html docs docs/_build/html
+	$(BIN)/sphinx-build -q -W -b dummy docs docs/_build/dummy
 
 bench: $(READY)  ## measure speed and accuracy; ratios are taken side by side in one run
 	$(BIN)/python scripts/bench.py
