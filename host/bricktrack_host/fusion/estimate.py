@@ -276,13 +276,18 @@ def _with_better_clocks(item: FusionInput, run: Run, s: Smoothed, settings: Fusi
     )  # fmt: skip
 
 
-def _fuse_one(item: FusionInput, settings: FusionSettings, with_forward: bool) -> FusionResult:
+def smooth_one(item: FusionInput, settings: FusionSettings) -> Smoothed:
+    """Return the smoothed states of one input, pose by pose."""
     run = prepare_run(item, settings)
     (smoothed,) = smooth_poses([run], settings)
     if run.camera is not None:
         run = _with_better_clocks(item, run, smoothed, settings)
         (smoothed,) = smooth_poses([run], settings, levels=[smoothed.levels])
-    return fused_result(item, smoothed, settings, with_forward=with_forward)
+    return smoothed
+
+
+def _fuse_one(item: FusionInput, settings: FusionSettings, with_forward: bool) -> FusionResult:
+    return fused_result(item, smooth_one(item, settings), settings, with_forward=with_forward)
 
 
 def fused_result(

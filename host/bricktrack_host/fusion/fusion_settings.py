@@ -20,6 +20,8 @@ class FusionSettings:
     lever_arm_sd_mm : float
         How well the IMU's place in the brick is known: to a millimetre as it is glued in, and to another
         within its case. It is estimated with the run.
+    camera_delay_sd_ns : float, ns
+        How well the delay of a moving camera's sensor against the brick's is known; estimated with the run.
     systematic_time_s : float
         How long errors by scale and lever arm keep their sign: about a tenth of a second at 2-10 Hz.
     roughness_share : float
@@ -69,6 +71,7 @@ class FusionSettings:
     acc_scale_sd: float = 0.004
     sensor_gain_sd: float = 0.01
     lever_arm_sd_mm: float = 2.0
+    camera_delay_sd_ns: float = 0.3e6
     systematic_time_s: float = 0.1
     roughness_share: float = 1.0
     gyro_impact_share: float = 0.3

@@ -17,13 +17,21 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment
 from bricktrack_host.fusion.cross_check import CrossCheck, cross_check
-from bricktrack_host.fusion.estimate import FusionInput, FusionResult, fused_result, prepare_run
+from bricktrack_host.fusion.estimate import (
+    CameraMotionKind,
+    FusionInput,
+    FusionResult,
+    fused_result,
+    require_observable,
+    smooth_one,
+)
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_smoothing import SmoothedLeds, smooth_leds
 from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion
-from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, smooth_poses
+from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraAlignment, CameraImu
+from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed
 from bricktrack_host.tracks import ImuTrack, LedObservations, OpticalTrack
 
 logger = logging.getLogger(__name__)
@@ -67,9 +75,12 @@ def fuse_tight(
     lever_arm_mm: ArrayLike,
     output_t_ns: IntArray,
     alignment: TimeAlignment | None = None,
+    camera: CameraMotionKind = "static",
+    camera_imu: CameraImu | None = None,
+    camera_alignment: CameraAlignment | None = None,
     settings: FusionSettings | None = None,
 ) -> TightResult:
-    """Return the motion of the brick from LED centroids and inertial samples together; static camera.
+    """Return the motion of the brick from LED centroids and inertial samples together.
 
     Parameters
     ----------
@@ -84,17 +95,22 @@ def fuse_tight(
     output_t_ns : ndarray of int64, shape (k,), camera time
     alignment : TimeAlignment, optional
         Estimated by `align_times` when not given.
+    camera, camera_imu, camera_alignment
+        Of a camera that moves, as in `bricktrack_host.fusion.estimate.fuse`.
     settings : FusionSettings, optional
 
     Raises
     ------
+    ConfigError
+        If the camera moves and there is no sensor with it.
     TrackingError
         If there is no optical pose.
     ShapeError
         If there are too few inertial samples, or arrays do not fit together.
     """
+    require_observable(camera, camera_imu)
     settings = settings or FusionSettings()
-    item = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment)
+    item = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment, camera_imu, camera_alignment)
     first, done = smooth_both(observations, item, ray_model, brick_model, settings)
     return tight_result(observations, item, first, done, settings)
 
@@ -107,7 +123,7 @@ def smooth_both(
     settings: FusionSettings,
 ) -> tuple[Smoothed, SmoothedLeds]:
     """Return the states of the pose-level smoother, and those of the tightly coupled one from there."""
-    first = smooth_poses([prepare_run(item, settings)], settings)[0]
+    first = smooth_one(item, settings)
     lever_arm_m = np.asarray(item.lever_arm_mm, dtype=np.float64) * 1e-3
     leds = SeenLeds.of(observations, ray_model)
     return first, smooth_leds(leds, first, ray_model, brick_model, lever_arm_m=lever_arm_m, settings=settings)

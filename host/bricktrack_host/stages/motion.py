@@ -154,7 +154,7 @@ def fuse_run(
     if inertial is not None and not inertial.is_hint and brick.imu_lever_arm_mm is not None:
         lever_arm_mm = brick.imu_lever_arm_mm
         try:
-            if seen is None or inertial.camera is not None:
+            if seen is None:
                 fusion = _by_poses(optical, inertial, lever_arm_mm, wanted)
             else:
                 fusion = _fuse_tight(
@@ -197,6 +197,8 @@ def _fuse_tight(
     tight = fuse_tight(
         observations, optical, inertial.imu, rays, brick,
         lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=inertial.alignment,
+        camera="static" if inertial.camera is None else inertial.camera.kind,
+        camera_imu=inertial.camera, camera_alignment=inertial.camera_alignment,
     )  # fmt: skip
     n_rejected = int(np.count_nonzero(tight.led_rejected))
     if n_rejected == 1:

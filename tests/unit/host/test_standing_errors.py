@@ -140,6 +140,6 @@ def test_an_led_that_is_off_all_the_time_is_found():
 
 def test_errors_stand_once_they_move_by_less_than_can_be_told():
     sd = np.array([0.02, 0.3, 0.0])  # the last is not believed in, and never moves
-    before = StandingErrors(np.array([0.1, -1.0, 0.0]), np.diag(sd**2), 0.01)
+    before = StandingErrors(np.array([0.1, -1.0, 0.0]), np.diag(sd**2), 0.01, 0)
     assert replace(before, value=before.value + 0.4 * sd).stand_since(before)
     assert not replace(before, value=before.value + np.array([0.0, 0.6 * 0.3, 0.0])).stand_since(before)

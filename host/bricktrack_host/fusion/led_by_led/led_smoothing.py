@@ -121,10 +121,13 @@ def smooth_leds(
     sights, _ = _sights(_placeable(leds, first, settings), first, ray_model, brick_model)
     now, use = first, np.ones(len(sights.leds.t_ns), dtype=np.bool_)
     for i in range(_PASSES):
-        done = _pass(sights, use, now, first, belief, n_leds)
+        done = _pass(sights, use, now, first, belief)
         leds, now = sights.leds, done.states
-        prior = StandingPrior.of(leds, done.pictured, n_leds, settings)
-        way = StandingWay(now.problem, now.passed, leds, done.pictured, n_leds, of=now.estimate.of)
+        still = now.nodes.camera_attitudes(now.run)
+        prior = StandingPrior.of(leds, done.pictured, n_leds, settings, camera_moves=still is not None)
+        way = StandingWay(
+            now.problem, now.passed, leds, done.pictured, n_leds, of=now.estimate.of, R_still_camera=still
+        )
         errors = way.estimate(prior, belief.errors.value)
         scales = centroid_scales(done.chi2, sights.still, done.use, belief.scales)
         more = (scales / belief.scales)[sights.still.astype(np.int64)]
@@ -147,12 +150,10 @@ def smooth_leds(
     return SmoothedLeds(leds, states, done.chi2, done.use, belief.scales, errors)
 
 
-def _pass(
-    sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, belief: _Belief, n_leds: int
-) -> _Pass:
+def _pass(sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, belief: _Belief) -> _Pass:
     """Smooth once, linearised at the motion ``now``."""
     settings, leds, pictured = belief.settings, sights.leds, sights.pictured
-    off_px = belief.errors.in_picture_px(leds, pictured, n_leds)
+    off_px = belief.errors.in_picture_px(leds, pictured)
     pictured = replace(pictured, residual_px=pictured.residual_px - off_px)
     use = use & pictured.is_facing
     lin = relinearised(now.run, now.estimate, now.b, len(now.nodes.t_s), settings)
@@ -206,4 +207,5 @@ def _without_frames(run: Run) -> Run:
         R_seen=np.zeros((0, 3, 3)),
         p_seen_m=np.zeros((0, 3)),
         cov_seen=np.zeros((0, 6, 6)),
+        still_s=np.zeros(0),
     )

@@ -20,7 +20,18 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import Pictured, SeenLeds
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
-from bricktrack_host.fusion.smoothing.sensor_errors import N_ERRORS, SensorErrors, root_of
+from bricktrack_host.fusion.smoothing.camera_errors import (
+    N_CAMERA_ERRORS,
+    CameraErrors,
+    CameraWay,
+    camera_prior_sd,
+)
+from bricktrack_host.fusion.smoothing.sensor_errors import (
+    N_ERRORS,
+    SensorErrors,
+    root_of,
+    sensor_prior_sd,
+)
 from bricktrack_host.fusion.smoothing.smoother import N_STATES, POS, Estimate, Filter, Problem
 from bricktrack_host.fusion.smoothing.standing_errors_kernel import carry_back, carry_forward
 from bricktrack_host.tracking.pose.refine import OWN_SHARE
@@ -38,15 +49,16 @@ _STAND_SD = 0.5  # of an error: what is not yet taken out of the motion is not i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandingErrors:
-    """Errors that stand still, in one vector of q = 23 + 2 L: estimated, and how unsure.
+    """Errors that stand still, in one vector of q = 23 + 2 L, or 45 + 2 L where the camera moves.
 
     In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
     the profile's, in units of its stated sd; the picture's size over what it should be, less 1; (u, v) of
-    each of L LEDs, px.
+    each of L LEDs, px; those of the sensor that moves with the camera, as in `CameraErrors.values`.
 
     Attributes
     ----------
     value : ndarray, shape (q,)
+        As estimated.
     covariance : ndarray, shape (q, q)
     offset_sd_px : float
         Of the errors of single LEDs, as the run says.
@@ -55,28 +67,33 @@ class StandingErrors:
     value: FloatArray
     covariance: FloatArray
     offset_sd_px: float
+    n_leds: int
 
     @classmethod
     def before(cls, run: Run, lever_arm_m: FloatArray, n_leds: int) -> "StandingErrors":
         """Return what was taken out of a run's sensor already, given where it was said to be."""
         gains = [(gain - np.eye(3)).ravel() for gain in (run.gyro_gain, run.acc_gain)]
-        value = np.concatenate([*gains, run.lever_arm_m - lever_arm_m, np.zeros(2 + 2 * n_leds)])
-        return cls(value, np.zeros((len(value), len(value))), 0.0)
+        theirs = np.zeros(0) if run.camera is None else run.camera.errors.values()
+        value = np.concatenate([*gains, run.lever_arm_m - lever_arm_m, np.zeros(2 + 2 * n_leds), theirs])
+        return cls(value, np.zeros((len(value), len(value))), 0.0, n_leds)
 
     def of_sensor(self, *, since: "StandingErrors") -> SensorErrors:
         """Return what the inertial sensor's errors have changed by."""
-        change = (self.value - since.value)[:N_ERRORS]
+        change = self.value - since.value
         gyro, acc = change[:18].reshape(2, 3, 3)
-        return SensorErrors(gyro, acc, change[_ARM], self.covariance[:N_ERRORS, :N_ERRORS])
+        theirs = _FIRST_LED + 2 * self.n_leds
+        at = np.append(np.arange(N_ERRORS), np.arange(theirs, len(change)))
+        camera = CameraErrors.of(change[theirs:]) if theirs < len(change) else None
+        return SensorErrors(gyro, acc, change[_ARM], self.covariance[np.ix_(at, at)], camera)
 
     def stand_since(self, before: "StandingErrors") -> bool:
         """Return whether they are where they were, as far as can be told."""
         change = np.abs(self.value - before.value)
         return bool((change <= _STAND_SD * np.sqrt(np.diag(self.covariance))).all())
 
-    def in_picture_px(self, leds: SeenLeds, pictured: Pictured, n_leds: int) -> FloatArray:
+    def in_picture_px(self, leds: SeenLeds, pictured: Pictured) -> FloatArray:
         """Return by how much the centroids are off for them, shape (m, 2)."""
-        offset = self.value[_FIRST_LED:].reshape(n_leds, 2)
+        offset = self.value[_FIRST_LED : _FIRST_LED + 2 * self.n_leds].reshape(self.n_leds, 2)
         common = (
             self.value[_PROFILE] * pictured.profile_shift_px + self.value[_SCALE] * pictured.from_centre_px
         )
@@ -93,32 +110,40 @@ class StandingPrior:
         Zero where none are believed.
     led_shift_px : ndarray, shape (L, 2)
         One standard deviation of each LED's profile, of which a share is its own.
+    camera_sd : ndarray, shape (22,), or (0,) where the camera stands still
     """
 
     sensor_sd: FloatArray
     led_shift_px: FloatArray
+    camera_sd: FloatArray
 
     @classmethod
-    def of(cls, leds: SeenLeds, pictured: Pictured, n_leds: int, settings: FusionSettings) -> "StandingPrior":
+    def of(
+        cls, leds: SeenLeds, pictured: Pictured, n_leds: int, settings: FusionSettings, *, camera_moves: bool
+    ) -> "StandingPrior":
         """Return the belief for a run: the profile's share as it is on the mean over the run."""
         count = np.maximum(np.bincount(leds.led, minlength=n_leds), 1)
         shift = [
             np.bincount(leds.led, part, minlength=n_leds) / count for part in pictured.profile_shift_px.T
         ]
-        sensor_sd = np.repeat([settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3], [18, 3])
-        return cls(sensor_sd, np.stack(shift, axis=1))
+        camera_sd = camera_prior_sd(settings) if camera_moves else np.zeros(0)
+        return cls(sensor_prior_sd(settings), np.stack(shift, axis=1), camera_sd)
 
     def covariance(self, offset_sd_px: ArrayLike) -> FloatArray:
         """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...)."""
         own = OWN_SHARE * self.led_shift_px
-        q = _FIRST_LED + own.size
+        last_led = _FIRST_LED + own.size
+        q = last_led + len(self.camera_sd)
         out = np.zeros((*np.shape(offset_sd_px), q, q))
         at = np.arange(q)
-        out[..., at, at] = np.concatenate([self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(own.size)])
+        out[..., at, at] = np.concatenate(
+            [self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(own.size), self.camera_sd**2]
+        )
         for led, shift in enumerate(own):
             part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
             out[..., part, part] = np.outer(shift, shift)
-        out[..., at[_FIRST_LED:], at[_FIRST_LED:]] += np.square(offset_sd_px)[..., None]
+        of_leds = at[_FIRST_LED:last_led]
+        out[..., of_leds, of_leds] += np.square(offset_sd_px)[..., None]
         return out
 
 
@@ -134,6 +159,8 @@ class StandingWay:
     n_leds : int
     of : ndarray of int64, shape (c,)
         The states whose covariance is wanted.
+    R_still_camera : ndarray, shape (K, 3, 3), optional
+        Attitudes of a moving camera at the nodes.
     """
 
     def __init__(
@@ -145,9 +172,12 @@ class StandingWay:
         n_leds: int,
         *,
         of: IntArray,
+        R_still_camera: FloatArray | None = None,
     ) -> None:
         m, n_nodes = len(leds.t_ns), len(problem.has_frame)
-        own = _own_part(problem, leds, pictured, n_leds)
+        self._camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, 0)
+        own = _own_part(problem, leds, pictured, n_leds, self._camera)
+        further = np.zeros((n_nodes - 1, 3, 0)) if self._camera is None else self._camera.velocity
         q, c = own.shape[2], len(of)
         self._run, self._of, self._R = passed.runs[0], of, np.empty((n_nodes, 3, 3))
         self._rows, self._changed = np.empty((n_nodes, c, N_STATES)), np.empty((n_nodes, c, q))
@@ -156,8 +186,8 @@ class StandingWay:
         carry_forward(
             self._run, np.ascontiguousarray(problem.gyro_var[:, 0]),
             np.ascontiguousarray(problem.acc_var[:, 0]), problem.start.R[0].copy(), problem.start.x[0].copy(),
-            problem.P_start[0].copy(), own, of, self._R, self._rows, self._changed, self._H, self._HP,
-            self._y, self._dy,
+            problem.P_start[0].copy(), own, further, of, self._R, self._rows, self._changed, self._H,
+            self._HP, self._y, self._dy,
         )  # fmt: skip
 
     def estimate(self, prior: StandingPrior, known: FloatArray) -> StandingErrors:
@@ -173,7 +203,8 @@ class StandingWay:
         believed = prior.covariance(offset_sd_px)
         _, value = _likeliest(believed, known, normal, pull)
         covariance = np.linalg.solve(np.eye(len(known)) + believed @ normal, believed)
-        return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px)
+        n_leds = len(prior.led_shift_px)
+        return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px, n_leds)
 
     def with_doubt(self, estimate: Estimate, errors: StandingErrors) -> Estimate:
         """Return smoothed states with what the errors leave unsure in their covariance."""
@@ -182,6 +213,10 @@ class StandingWay:
         # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
         at = np.searchsorted(self._of, np.arange(POS.start, POS.stop))[:, None]
         changed[:, at, np.arange(_ARM.start, _ARM.stop)] -= self._R
+        if self._camera is not None:
+            state = estimate.state
+            theirs = self._camera.of_output(state.R[:, 0], state.x[:, 0, POS], self._of)
+            changed[:, :, -N_CAMERA_ERRORS:] += theirs
         doubt = changed @ root_of(errors.covariance)
         more = doubt @ np.swapaxes(doubt, 1, 2)
         covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
@@ -190,19 +225,25 @@ class StandingWay:
         return replace(estimate, covariance=covariance, variance=variance, doubt=doubt[:, None])
 
 
-def _own_part(problem: Problem, leds: SeenLeds, pictured: Pictured, n_leds: int) -> FloatArray:
+def _own_part(
+    problem: Problem, leds: SeenLeds, pictured: Pictured, n_leds: int, camera: CameraWay | None
+) -> FloatArray:
     """Return what each error changes of each LED's residual by itself, shape (m, 2, q)."""
     arrays = problem.leds
     if arrays is None:
         raise ValueError("the problem has no LEDs")
     m = len(leds.t_ns)
     own = np.zeros((m, 2, _FIRST_LED + 2 * n_leds))
-    own[:, :, _ARM] = arrays.J[..., 3:] @ pictured.R_camera_brick
+    own[:, :, _ARM] = arrays.J[..., 3:] @ arrays.R_lin
     own[:, :, _PROFILE], own[:, :, _SCALE] = -pictured.profile_shift_px, -pictured.from_centre_px
     at = _FIRST_LED + 2 * leds.led
     own[np.arange(m), 0, at] = -1.0
     own[np.arange(m), 1, at + 1] = -1.0
-    return own
+    if camera is None:
+        return own
+    node = np.repeat(np.arange(len(problem.has_frame)), np.diff(arrays.first[:, 0]))
+    moved = camera.of_seen(arrays.R_lin, arrays.t_lin_m, camera.t_s[node] + arrays.dt_s)
+    return np.concatenate([own, arrays.J @ moved], axis=2)
 
 
 def _likeliest(

@@ -54,6 +54,8 @@ class Run:
     camera : CameraMotion or None
         Where the camera moves: poses are then in still axes about its IMU, and gravity is its accelerometer's
         bias.
+    still_s : ndarray, shape (n,), or (0,)
+        There, IMU time of the frames at which the camera's attitude was taken.
     gyro_gain, acc_gain : ndarray, shape (3, 3)
         Of the samples over the truth, as far as is known.
     sensor_covariance : ndarray, shape (21, 21) or (42, 42)
@@ -73,6 +75,7 @@ class Run:
     t_mid_s: float
     span_cam_s: tuple[float, float]
     camera: CameraMotion | None = None
+    still_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     gyro_gain: FloatArray = field(default_factory=lambda: np.eye(3))
     acc_gain: FloatArray = field(default_factory=lambda: np.eye(3))
     sensor_covariance: FloatArray = field(default_factory=lambda: np.zeros((21, 21)))
@@ -95,9 +98,10 @@ class Run:
         else:
             samples = clean_samples(imu)
         signal = ImuSignal.from_samples(samples, gyro_filter_s=alignment.gyro_filter_s)
+        seen, still_s = np.flatnonzero(has_pose(optical)), np.zeros(0)
         if camera is not None:
-            optical = still_track(optical, camera, imu_seconds(alignment, optical.t_ns, signal.epoch_ns))
-        seen = np.flatnonzero(has_pose(optical))
+            t_s = imu_seconds(alignment, optical.t_ns, signal.epoch_ns)
+            optical, still_s = still_track(optical, camera, t_s), t_s[seen]
         t_cam_s = seconds_since(optical.t_ns[seen], signal.epoch_ns)
         cov = optical.covariance[seen].copy()
         cov[:, 3:] *= 1e-3
@@ -126,6 +130,7 @@ class Run:
             t_mid_s=(alignment.t_mid_ns - signal.epoch_ns) * 1e-9,
             span_cam_s=span,
             camera=camera,
+            still_s=still_s,
         )
 
     def with_acc_loss(self, loss_s2: float) -> "Run":
@@ -143,7 +148,7 @@ class Run:
             camera = self.camera.with_acc_loss(0.0)
             if errors.camera is not None:
                 camera = self.camera.with_sensor(errors.camera)
-                R_seen, p_seen_m = camera.poses_from(self.camera, self.aligned_s(), R_seen, p_seen_m)
+                R_seen, p_seen_m = camera.poses_from(self.camera, self.still_s, R_seen, p_seen_m)
         return replace(
             self,
             signal=ImuSignal.from_samples(
@@ -157,6 +162,15 @@ class Run:
             acc_gain=acc_gain,
             sensor_covariance=errors.covariance,
         )
+
+    def seen_at(self, lin: Linearisation) -> "Run":
+        """Return the run with the poses of a camera that moves in still axes by better clocks."""
+        if self.camera is None:
+            return self
+        t_s = self.imu_time_s(self.t_cam_s, lin)
+        seen = self.camera.from_still(self.still_s, self.R_seen, self.p_seen_m)
+        R_seen, p_seen_m = self.camera.to_still(t_s, *seen)
+        return replace(self, R_seen=R_seen, p_seen_m=p_seen_m, still_s=t_s)
 
     def noise_parts(self, t_s: FloatArray, lin: Linearisation, settings: FusionSettings) -> NoiseParts:
         """Return how far all sensors are to be trusted over steps between instants of IMU time."""

@@ -8,7 +8,7 @@ accelerometer bias of A stands in gravity's place. The gyro bias of A is that un
 began: N then turns by some 1e-4 rad/s, which changes what stands for gravity by far less than the noise.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -70,6 +70,8 @@ class CameraMotion:
         The camera's IMU stamps an instant later than the brick's by ``delay + rate * (t - mid)``.
     imu_to_camera_m : ndarray, shape (3,)
     kind : "imu" or "table"
+    errors : CameraErrors
+        Of the sensor, taken out so far.
     """
 
     imu: ImuTrack
@@ -83,6 +85,7 @@ class CameraMotion:
     mid_s: float
     imu_to_camera_m: FloatArray
     kind: Literal["imu", "table"]
+    errors: CameraErrors = field(default_factory=CameraErrors)
 
     def with_acc_loss(self, loss_s2: float) -> "CameraMotion":
         """Return the motion with the accelerometer's low-pass undone, if it is one like the brick's."""
@@ -104,7 +107,9 @@ class CameraMotion:
             signal=signal,
             bias_radps=bias,
             attitude=Attitude(signal, bias),
+            delay_s=self.delay_s + errors.delay_s,
             imu_to_camera_m=self.imu_to_camera_m + errors.arm_m,
+            errors=CameraErrors.of(self.errors.values() + errors.values()),
         )
 
     def poses_from(

@@ -102,7 +102,7 @@ def smooth_poses(
         used[b] = good if good.mean() > 0.5 else used[b]  # else it is not the frames that are wrong
     # Relinearised once, with what the first pass found of clocks, noise and outliers.
     lins = [relinearised(runs[b], first.estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
-    runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(first.runs, lins, strict=True)]
+    runs = [run.with_acc_loss(lin.loss_s2).seen_at(lin) for run, lin in zip(first.runs, lins, strict=True)]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
     for is_last in [False] * (_LAST_PASSES - 1) + [True]:
         problem, _ = build_problem(

@@ -16,7 +16,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import skew
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.smoothing.camera_errors import ACC, ARM, GYRO, CameraErrors, CameraWay
+from bricktrack_host.fusion.smoothing.camera_errors import CameraErrors, CameraWay, camera_prior_sd
 from bricktrack_host.fusion.smoothing.sensor_errors_kernel import carry_back, carry_forward
 from bricktrack_host.fusion.smoothing.smoother import (
     BG,
@@ -44,8 +44,8 @@ class SensorErrors:
         Sample = (1 + this) @ truth, to first order.
     arm_m : ndarray, shape (3,), brick axes
         True lever arm less the one given.
-    covariance : ndarray, shape (21, 21), or (42, 42) where the camera moves
-        Of gyro and acc, row by row, and arm_m; and of the camera's sensor in the same order.
+    covariance : ndarray, shape (21, 21), or (43, 43) where the camera moves
+        Of gyro and acc, row by row, and arm_m; and of the camera's sensor, see `CameraErrors.values`.
     camera : CameraErrors or None
         Of the sensor that moves with the camera.
     """
@@ -55,6 +55,11 @@ class SensorErrors:
     arm_m: FloatArray
     covariance: FloatArray
     camera: CameraErrors | None = None
+
+
+def sensor_prior_sd(settings: FusionSettings) -> FloatArray:
+    """Return what is believed of the errors' sizes before a run speaks, shape (21,)."""
+    return np.repeat([settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3], [18, 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +96,8 @@ def _way(problem: Problem, passed: Filter, b: int, *, of: IntArray, camera: Came
     own[:, 3:, _ARM] = R + R @ skew(turn) * ahead[:, None, None]
     further = np.zeros((len(problem.dt_s), 3, 0))
     if camera is not None:
-        own = np.concatenate([own, camera.of_frames(problem, R, at, b)], axis=2)
+        theirs = camera.of_seen(R, problem.p_seen_m[at, b], camera.t_s[at])
+        own = np.concatenate([own, theirs], axis=2)
         further = np.ascontiguousarray(camera.velocity)
     H = np.ascontiguousarray(H)
     changed, dy = carry_forward(passed.runs[b], at, before.R, H, gain, own, further, of)
@@ -118,8 +124,9 @@ def estimate_sensor_errors(
         Attitudes of a moving camera at the run's nodes.
     """
     camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, b)
-    prior_sd = np.repeat([settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3], [18, 3])
-    prior_sd = np.tile(prior_sd, 1 if camera is None else 2)
+    prior_sd = sensor_prior_sd(settings)
+    if camera is not None:
+        prior_sd = np.append(prior_sd, camera_prior_sd(settings))
     believed = prior_sd > 0
     if not believed.any() or not problem.has_frame[:, b].any():
         return None
@@ -134,9 +141,7 @@ def estimate_sensor_errors(
     found = SensorErrors(gyro, acc, errors[_ARM], covariance)
     if camera is None:
         return found
-    theirs = errors[N_ERRORS:]
-    gyro, acc = theirs[GYRO].reshape(3, 3), theirs[ACC].reshape(3, 3)
-    return replace(found, camera=CameraErrors(gyro, acc, theirs[ARM]))
+    return replace(found, camera=CameraErrors.of(errors[N_ERRORS:]))
 
 
 def with_sensor_doubt(
@@ -149,7 +154,7 @@ def with_sensor_doubt(
 ) -> Estimate:
     """Return smoothed states with what the errors of the sensors leave unsure added to their covariance.
 
-    ``sensor_covariance``: of each run of the batch, shape (21, 21), or (42, 42) where the camera moves; zero
+    ``sensor_covariance``: of each run of the batch, shape (21, 21), or (43, 43) where the camera moves; zero
     where all is known. ``R_still_camera``: as `estimate_sensor_errors`, of each run whose camera moves.
     """
     covariance, variance = estimate.covariance.copy(), estimate.variance.copy()

@@ -14,7 +14,6 @@ from bricktrack_host.fusion.smoothing.transition_kernel import RunArrays, transi
 
 _N = 22
 _MOVING = 9
-_OWN_ERRORS = 21
 
 
 @compiled
@@ -33,12 +32,13 @@ def drive(run: RunArrays, k: int, R: Any, now: Any) -> None:
 
 
 @compiled
-def _drive_further(h: float, further: Any, now: Any) -> None:
-    """Add what errors beside the sensor's own do to the velocity, shape (3, c), and so to the position."""
+def drive_further(h: float, further: Any, now: Any) -> None:
+    """Add what the last c errors, not the sensor's own, do to velocity, shape (3, c), and so to position."""
+    first = now.shape[1] - further.shape[1]
     for r in range(3):
         for c in range(further.shape[1]):
-            now[6 + r, _OWN_ERRORS + c] += further[r, c]
-            now[3 + r, _OWN_ERRORS + c] += 0.5 * h * further[r, c]
+            now[6 + r, first + c] += further[r, c]
+            now[3 + r, first + c] += 0.5 * h * further[r, c]
 
 
 @compiled
@@ -69,7 +69,7 @@ def carry_forward(
             transition(run, k - 1, R[k - 1], F)
             now[:_MOVING] = F @ now
             drive(run, k - 1, R[k - 1], now)
-            _drive_further(run.dt_s[k - 1], further[k - 1], now)
+            drive_further(run.dt_s[k - 1], further[k - 1], now)
         for c in range(len(of)):
             predicted[k, c] = now[of[c]]
         if frame < len(at) and at[frame] == k:

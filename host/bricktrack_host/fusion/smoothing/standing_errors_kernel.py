@@ -11,7 +11,7 @@ import numpy as np
 
 from bricktrack_host.compiled import compiled, compiled_sums
 from bricktrack_host.fusion.smoothing.covariance_kernel import F_SIZE, M, N, step_back, step_forward
-from bricktrack_host.fusion.smoothing.sensor_errors_kernel import drive
+from bricktrack_host.fusion.smoothing.sensor_errors_kernel import drive, drive_further
 from bricktrack_host.fusion.smoothing.smoother_kernel import (
     CHUNK,
     Kept,
@@ -51,6 +51,7 @@ def carry_forward(
     x: Any,
     P_start: Any,
     own: Any,
+    further: Any,
     of: Any,
     R_nodes: Any,
     rows: Any,
@@ -67,6 +68,8 @@ def carry_forward(
     own : ndarray, shape (m, 2, q), px
         What the errors change of each LED's residual by themselves; the first 18 are those of the inertial
         samples, which drive the states as well.
+    further : ndarray, shape (K - 1, 3, c), m/s
+        What the last c errors change of the velocity in each step.
     of : ndarray of int64, shape (c,)
         The states that are wanted.
     R_nodes, rows, changed : ndarray, shape (K, 3, 3), (K, c, 22), (K, c, q)
@@ -87,6 +90,7 @@ def carry_forward(
                 transition(run, k - 1, R_nodes[k - 1], F)
                 step_forward(F_flat, now, run.dt_s[k - 1], q)
                 drive(run, k - 1, R_nodes[k - 1], now_rows)
+                drive_further(run.dt_s[k - 1], further[k - 1], now_rows)
             m = kept.first[k - start]
             for i in range(leds.first[k, 0], leds.first[k + 1, 0]):
                 if leds.use[i]:
