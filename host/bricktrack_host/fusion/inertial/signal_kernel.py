@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.compiled import compiled, compiled_sums
+from bricktrack_host.compiled import compiled, compiled_inline
 from bricktrack_host.fusion.inertial.rotation_kernel import rotation_of, times
 
 _LONGEST_SUBSTEP_S = 2.5e-3  # cubic signal, exact integrals: coning left below 1e-8 rad
@@ -44,7 +44,7 @@ class SignalPieces(NamedTuple):
     acc: FloatArray
 
 
-@compiled_sums
+@compiled_inline
 def piece_of(knots_s: FloatArray, t_s: float, near: int) -> int:
     """Return the piece that holds an instant, looked for from a piece nearby."""
     last = len(knots_s) - 2
@@ -58,7 +58,7 @@ def piece_of(knots_s: FloatArray, t_s: float, near: int) -> int:
     return i
 
 
-@compiled_sums
+@compiled_inline
 def _value(coefficients: FloatArray, i: int, axis: int, s: float) -> float:
     """Return the value of a piece, ``s`` after its start."""
     value = coefficients[0, i, axis]
@@ -67,7 +67,7 @@ def _value(coefficients: FloatArray, i: int, axis: int, s: float) -> float:
     return float(value)
 
 
-@compiled_sums
+@compiled_inline
 def held_value(
     integral: FloatArray, signal: FloatArray, i: int, axis: int, t_s: float, pieces: GyroPieces
 ) -> float:
@@ -78,24 +78,24 @@ def held_value(
     return value if t_s == held else value + _value(signal, i, axis, s) * (t_s - held)
 
 
-@compiled_sums
+@compiled_inline
 def _cubic(c: Any, i: int, axis: int, s: float) -> float:
     return float(((c[0, i, axis] * s + c[1, i, axis]) * s + c[2, i, axis]) * s + c[3, i, axis])
 
 
-@compiled_sums
+@compiled_inline
 def _quartic(c: Any, i: int, axis: int, s: float) -> float:
     value = ((c[0, i, axis] * s + c[1, i, axis]) * s + c[2, i, axis]) * s + c[3, i, axis]
     return float(value * s + c[4, i, axis])
 
 
-@compiled_sums
+@compiled_inline
 def _quintic(c: Any, i: int, axis: int, s: float) -> float:
     value = ((c[0, i, axis] * s + c[1, i, axis]) * s + c[2, i, axis]) * s + c[3, i, axis]
     return float((value * s + c[4, i, axis]) * s + c[5, i, axis])
 
 
-@compiled_sums
+@compiled_inline
 def _angle_at(pieces: SignalPieces, t_s: float, near: int, out: Any) -> int:
     """Write the integral of the angular rate, held constant beyond the samples; return the piece."""
     held = min(max(t_s, pieces.span_s[0]), pieces.span_s[1])
@@ -123,7 +123,7 @@ class _Room(NamedTuple):
     middle: FloatArray
 
 
-@compiled_sums
+@compiled_inline
 def _felt(
     pieces: SignalPieces,
     t_s: float,
@@ -158,7 +158,7 @@ def _felt(
     return j
 
 
-@compiled_sums
+@compiled_inline
 def _turn_since(room: _Room, angle_rate_bias: Any, h: float, R: Any) -> None:
     """Turn R by how the angle has changed since the instant before."""
     now, before = room.angle, room.angle_before
@@ -172,7 +172,7 @@ def _turn_since(room: _Room, angle_rate_bias: Any, h: float, R: Any) -> None:
         before[a] = now[a]
 
 
-@compiled_sums
+@compiled_inline
 def _integrate_step(
     pieces: SignalPieces,
     start_s: float,
