@@ -304,7 +304,10 @@ class ImuSignal:
     def angle_at(self, t_s: FloatArray) -> FloatArray:
         """Return the integral of the measured angular rate, component by component, rad."""
         held = self._held(t_s)
-        return np.asarray(self._gyro.once(held) + self._gyro.spline(held) * (t_s - held)[..., None])
+        angle, beyond = self._gyro.once(held), t_s != held
+        if beyond.any():
+            angle[beyond] += self._gyro.spline(held[beyond]) * (t_s - held)[beyond][..., None]
+        return np.asarray(angle)
 
     def in_gap(self, t_s: FloatArray, *, least_periods: float = 0.0) -> BoolArray:
         """Return which instants lie where samples are missing for so long, or beyond the samples."""
