@@ -6,7 +6,7 @@ were all there and decoded without an error, and so did every picture back to it
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -67,8 +67,10 @@ class DecodedFrame:
         return 0 if self.picture is not None else int(PoseFlag.FRAME_LOST)
 
 
-def decode_run_video(video: Path, frames: FrameTimes, *, threads: int = 2) -> Iterator[DecodedFrame]:
-    """Yield every frame of a run in order, decoded or lost.
+def decode_run_video(
+    video: Path, frames: FrameTimes, *, threads: int = 2, part: range | None = None
+) -> Generator[DecodedFrame, None, None]:
+    """Yield every frame of a run, or of a part of it, in order, decoded or lost.
 
     Packets are cut from the file by the byte offsets of ``frames`` and carry their index through the decoder,
     so a picture is paired with its record by value and never by counting. Only the decoder's own pictures
@@ -85,6 +87,8 @@ def decode_run_video(video: Path, frames: FrameTimes, *, threads: int = 2) -> It
         As `bricktrack_common.frame_times.read_frames` returns them.
     threads : int
         Of the decoder.
+    part : range, optional
+        Indices of frames, which begin where prediction begins anew; see `video_parts`. All if not given.
 
     Raises
     ------
@@ -92,11 +96,12 @@ def decode_run_video(video: Path, frames: FrameTimes, *, threads: int = 2) -> It
         If the file cannot be opened, its pictures are not 8-bit YUV 4:2:0 or change size, or they come out
         in another order than they were stored in (B pictures).
     """
-    if frames.n_frames == 0:
+    part = range(frames.n_frames) if part is None else part
+    if not part:
         return
     try:
         with video.open("rb") as file:
-            yield from _Decoding(video, frames, threads).run(file)
+            yield from _Decoding(video, frames, threads, part).run(file)
     except OSError as e:
         raise VideoError(f"{video}: {e.strerror or e}") from e
 
@@ -104,14 +109,15 @@ def decode_run_video(video: Path, frames: FrameTimes, *, threads: int = 2) -> It
 class _Decoding:
     """One pass over a video: what was fed, what was lost, what came out."""
 
-    def __init__(self, video: Path, frames: FrameTimes, threads: int) -> None:
+    def __init__(self, video: Path, frames: FrameTimes, threads: int, part: range) -> None:
         self._video = video
         self._frames = frames
+        self._part = part
         self._cut: dict[int, str] = {}  # never fed
         self._gaps: set[int] = set()  # predicted from a picture that the file does not hold
         self._restarts: set[int] = set()
         self._order = PictureOrder()
-        self._next = 0
+        self._next = part.start
         self._chain = ""  # why pictures until the next keyframe are lost; empty while all is well
         self._size: tuple[int, int] | None = None
         self._codec = _open_decoder(threads)
@@ -119,10 +125,9 @@ class _Decoding:
     def run(self, file: BinaryIO) -> Iterator[DecodedFrame]:
         if os.fstat(file.fileno()).st_size == 0:
             raise VideoError(f"{self._video}: the file is empty")
-        for i, (offset, n_bytes) in enumerate(
-            zip(self._frames.byte_offset.tolist(), self._frames.n_bytes.tolist(), strict=True)
-        ):
-            file.seek(offset)
+        for i in self._part:
+            n_bytes = int(self._frames.n_bytes[i])
+            file.seek(int(self._frames.byte_offset[i]))
             unit = file.read(n_bytes)
             if len(unit) < n_bytes:
                 size = os.fstat(file.fileno()).st_size
@@ -154,13 +159,13 @@ class _Decoding:
                 continue
             yield from self._take(decoded)
             break
-        for i in range(self._next, self._frames.n_frames):
+        for i in range(self._next, self._part.stop):
             yield self._lose(i, "its bytes are damaged: the decoder gave no picture")
 
     def _take(self, decoded: list[VideoFrame]) -> Iterator[DecodedFrame]:
         for frame in decoded:
             i = frame.pts
-            if i is None or not self._next <= i < self._frames.n_frames:
+            if i is None or not self._next <= i < self._part.stop:
                 if self._order.n_b_pictures >= 2:  # one alone may be a damaged header
                     raise VideoError(
                         f"{self._video}: not stored in the order of time (B pictures). {REENCODE}"

@@ -1,6 +1,5 @@
 """The stage of the pictures: decode, find the LEDs, keep a few for the report."""
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,10 +9,11 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import VideoError
 from bricktrack_common.frame_times import FrameTimes
 from bricktrack_common.run_folder import Run
-from bricktrack_host.recordings.video_frames import decode_run_video
+from bricktrack_host.recordings.video_frames import DecodedFrame
+from bricktrack_host.recordings.video_parts import work_on_frames
 from bricktrack_host.stages.progress import ProcessProgress, Silent
-from bricktrack_host.tracking.pictures.run_lights import find_run_lights
-from bricktrack_host.tracking.pictures.segment import Blobs, Picture, Plane
+from bricktrack_host.tracking.pictures.run_lights import light_finder
+from bricktrack_host.tracking.pictures.segment import Blobs, Plane
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
 if TYPE_CHECKING:
@@ -51,16 +51,6 @@ class RunPictures:
         self._kept: dict[int, Plane] = {}
         self._lost: dict[str, list[int]] = {}
 
-    def stream(self) -> Iterator[tuple[int, Picture]]:
-        """Yield the pictures that can be trusted, with their place in the run."""
-        for frame in decode_run_video(self._video, self._frames):
-            if frame.picture is None:
-                self._lost.setdefault(frame.lost_because, []).append(frame.index)
-                continue
-            if frame.index in self._keep:
-                self._kept[frame.index] = frame.picture.luma.copy()
-            yield frame.index, frame.picture
-
     def observe(
         self, rays: RayModel, brick: BrickModel, method: "SegmentMethod", progress: ProcessProgress
     ) -> LedObservations:
@@ -70,11 +60,21 @@ class RunPictures:
     def lights(
         self, rays: RayModel, brick: BrickModel, method: "SegmentMethod", progress: ProcessProgress
     ) -> list[Blobs | None]:
-        """Return what could be an LED in each picture."""
-        return find_run_lights(
-            self.stream(), rays, brick, n_frames=self._frames.n_frames, method=method,
-            progress=progress.advance_to,
-        )  # fmt: skip
+        """Return what could be an LED in each picture; `None` where it is lost."""
+        find = light_finder(rays, brick, method)
+
+        def lights_of(frame: DecodedFrame) -> Blobs | str:
+            if frame.picture is None:
+                return frame.lost_because
+            if frame.index in self._keep:
+                self._kept[frame.index] = frame.picture.luma.copy()
+            return find(frame.index, frame.picture)
+
+        found = work_on_frames(self._video, self._frames, lights_of, progress=progress.advance_to)
+        for i, why in enumerate(found):
+            if isinstance(why, str):
+                self._lost.setdefault(why, []).append(i)
+        return [None if isinstance(lights, str) else lights for lights in found]
 
     def observations(
         self, lights: list[Blobs | None], rays: RayModel, brick: BrickModel, method: "SegmentMethod"
@@ -100,7 +100,7 @@ class RunPictures:
         from bricktrack_host.reporting.plots import FrameOverlay
 
         out = []
-        for i, luma in self._kept.items():
+        for i, luma in sorted(self._kept.items()):
             predicted = observations.uv_px[i] - optical.residual_px[i]
             seconds = (optical.t_ns[i] - optical.t_ns[0]) / 1e9
             out.append(FrameOverlay(f"frame {i}, {seconds:.2f} s", luma, observations.uv_px[i], predicted))

@@ -3,30 +3,16 @@
 import io
 import os
 
-import av
 import numpy as np
 import pytest
-from small_videos import HEIGHT, PERIOD_US, WIDTH, grey_of, write_video
+from small_videos import HEIGHT, WIDTH, damage, frame_times, grey_of, write_cut_scenes, write_video
 
 from bricktrack_common.errors import VideoError
-from bricktrack_common.frame_times import FrameTimes
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.recordings.annex_b import split_access_units
 from bricktrack_host.recordings.video_frames import decode_run_video
 
 N, GOP = 32, 8
 MEAN_TOLERANCE = 3  # grey levels; CRF 18 errs by less than one, neighbours differ by 37
-
-
-def frame_times(path):
-    units = split_access_units(path.read_bytes())
-    i = np.arange(len(units))
-    return FrameTimes(
-        pts_us=i * PERIOD_US, sensor_timestamp_ns=10**12 + i * PERIOD_US * 1000, exposure_us=np.full(len(i), 4000),
-        analogue_gain=np.ones(len(i)), keyframe=np.array([u.keyframe for u in units]),
-        byte_offset=np.array([u.byte_offset for u in units]), n_bytes=np.array([u.n_bytes for u in units]),
-        flags=np.zeros(len(i), np.int64), leftover_bytes=0,
-    )  # fmt: skip
 
 
 @pytest.fixture
@@ -52,13 +38,6 @@ def check(path, frames, *, threads=2):
             assert abs(float(frame.picture.luma.mean()) - grey_of(frame.index)) < MEAN_TOLERANCE
     assert indices == list(range(frames.n_frames))
     return lost
-
-
-def damage(path, frames, i, change):
-    data = bytearray(path.read_bytes())
-    start, n = int(frames.byte_offset[i]), int(frames.n_bytes[i])
-    data[start : start + n] = change(bytes(data[start : start + n]))
-    path.write_bytes(data)
 
 
 def until_keyframe(i):
@@ -203,24 +182,6 @@ def test_leaving_early_closes_the_file(video):
     frames = decode_run_video(*video)
     assert next(frames).index == 0
     frames.close()
-
-
-def write_cut_scenes(path, refs):
-    """Encode two scenes; at the cut, picture 16, x264 puts an intra picture that is no IDR."""
-    draw = np.random.default_rng(0)
-    options = f"keyint=200:min-keyint=100:scenecut=80:ref={refs}:repeat-headers=1"
-    with av.open(str(path), "w", format="h264") as container:
-        stream = container.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        stream.options = {"bf": "0", "crf": "18", "preset": "fast", "threads": "1", "x264-params": options}
-        for i in range(N):
-            if i % 16 == 0:
-                picture = draw.integers(20, 220, (HEIGHT * 3 // 2, WIDTH)).astype(np.uint8)
-            frame = av.VideoFrame.from_ndarray(picture, format="yuv420p")
-            frame.pts = i
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    assert split_access_units(path.read_bytes())[16].keyframe is False
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ measured at full resolution; no picture is kept.
 
 from collections.abc import Callable, Iterable
 from contextlib import closing
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -53,14 +52,7 @@ def find_run_lights(
         If the method is unknown, a picture's index is not below ``n_frames`` or out of order, or its size is
         not that of the calibration.
     """
-    if method not in ("default", "paper"):
-        raise TrackingError(f"segmentation method is {method!r}; expected 'default' or 'paper'")
-    radius_px, mode = usual_radius_px(ray_model, brick_model), ray_model.sensor_mode
-    find: Callable[[Picture], Blobs] = (
-        partial(paper_filter, limits=PaperLimits.for_radius(radius_px))
-        if method == "paper"
-        else partial(find_blobs, radius_px=radius_px)
-    )
+    find = light_finder(ray_model, brick_model, method)
     lights: list[Blobs | None] = [None] * n_frames
     last = -1
     with closing(look_ahead(pictures)) as ahead:
@@ -70,17 +62,39 @@ def find_run_lights(
                     f"picture of frame {i} after frame {last}, with {n_frames} time stamps; expected rising "
                     "indices below their number"
                 )
-            if picture.luma.shape != (mode.height, mode.width):
-                raise TrackingError(
-                    f"frame {i} has {picture.luma.shape[1]} x {picture.luma.shape[0]} pixels; the "
-                    f"calibration is of mode {mode.name}, {mode.width} x {mode.height}. Use the calibration "
-                    "of the run's mode."
-                )
             last = i
-            lights[i] = find(picture)
+            lights[i] = find(i, picture)
             if progress is not None:
                 progress(done)
     return lights
+
+
+def light_finder(
+    ray_model: RayModel, brick_model: BrickModel, method: Literal["default", "paper"] = "default"
+) -> Callable[[int, Picture], Blobs]:
+    """Return what finds the lights of LED size in the picture of a frame, given its index; for any thread.
+
+    Raises
+    ------
+    TrackingError
+        If the method is unknown; from what is returned, if a picture's size is not that of the calibration.
+    """
+    if method not in ("default", "paper"):
+        raise TrackingError(f"segmentation method is {method!r}; expected 'default' or 'paper'")
+    radius_px, mode = usual_radius_px(ray_model, brick_model), ray_model.sensor_mode
+    limits = PaperLimits.for_radius(radius_px)
+
+    def find(i: int, picture: Picture) -> Blobs:
+        if picture.luma.shape != (mode.height, mode.width):
+            raise TrackingError(
+                f"frame {i} has {picture.luma.shape[1]} x {picture.luma.shape[0]} pixels; the calibration is "
+                f"of mode {mode.name}, {mode.width} x {mode.height}. Use the calibration of the run's mode."
+            )
+        if method == "paper":
+            return paper_filter(picture, limits=limits)
+        return find_blobs(picture, radius_px=radius_px)
+
+    return find
 
 
 def usual_radius_px(ray_model: RayModel, brick_model: BrickModel) -> float:
