@@ -122,14 +122,15 @@ def find_sample_clock(
         sd = min(fit.residual_sd for _, _, fit in tried)
         return min(tried, key=lambda one: one[2].misfit / sd**2 + one[0].read_cost)
 
-    best = best_of(search.ways(way, rate_sd=STEP_S / search.span_s))
-    if best is None:
+    near = search.ways(way, rate_sd=STEP_S / search.span_s)[:1]
+    found = best_of(near)
+    if found is None:
         return None
-    # The attitudes know the rate better than the rotations between frames: once more with theirs.
-    way, _, fit = best
+    # The attitudes know the rate better than the rotations between frames, whichever way is right: once more
+    # with theirs.
+    way, _, fit = found
     way = replace(way, rate=way.rate - fit.skew)
-    best = best_of(search.ways(way, rate_sd=_RATE_STEP)) or best
-    _, clock, fit = best
+    _, clock, fit = best = best_of(search.ways(way, rate_sd=_RATE_STEP)) or found
     if not search.has_repeats:
         # Stamps at a wrong rate are a straight line and no saw-tooth, and so is one that never wraps.
         read = np.flatnonzero((imu.flags & int(UNUSABLE)) == 0)
