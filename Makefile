@@ -1,5 +1,8 @@
 # Each target makes what it needs: the first one builds .venv with the versions of constraints.txt.
 PYTHON ?= python3
+# Modules are compiled when they are first imported, and kept, whatever the environment says: else each of the hundreds
+# of processes that the tests start would compile them again.
+unexport PYTHONDONTWRITEBYTECODE
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
