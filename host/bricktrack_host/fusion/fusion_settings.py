@@ -20,8 +20,9 @@ class FusionSettings:
     lever_arm_sd_mm : float
         How well the IMU's place in the brick is known: to a millimetre as it is glued in, and to another
         within its case. It is estimated with the run.
-    camera_delay_sd_ns : float, ns
-        How well the delay of a moving camera's sensor against the brick's is known; estimated with the run.
+    camera_delay_sd_ns, camera_delay_rate_sd : float, ns and 1
+        How well the delay of a moving camera's sensor against the brick's is known, and its rate: sensors
+        sample by oscillators of their own. Both are estimated with the run.
     systematic_time_s : float
         How long errors by scale and lever arm keep their sign: about a tenth of a second at 2-10 Hz.
     roughness_share : float
@@ -72,6 +73,7 @@ class FusionSettings:
     sensor_gain_sd: float = 0.01
     lever_arm_sd_mm: float = 2.0
     camera_delay_sd_ns: float = 0.3e6
+    camera_delay_rate_sd: float = 5e-4
     systematic_time_s: float = 0.1
     roughness_share: float = 1.0
     gyro_impact_share: float = 0.3

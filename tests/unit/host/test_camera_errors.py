@@ -13,7 +13,7 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import build_problem, first_linearisation, place_nodes
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraImu
-from bricktrack_host.fusion.smoothing.camera_errors import CameraErrors
+from bricktrack_host.fusion.smoothing.camera_errors import N_CAMERA_ERRORS, CameraErrors
 from bricktrack_host.fusion.smoothing.sensor_errors import (
     SensorErrors,
     estimate_sensor_errors,
@@ -24,7 +24,7 @@ from bricktrack_host.fusion.smoothing.smoother import POS, SEEN, Filter
 GYRO = np.array([[0.008, -0.004, 0.005], [0.003, -0.010, 0.002], [-0.005, 0.004, 0.007]])
 ACC = np.array([[-0.007, 0.005, 0.004], [-0.005, 0.009, -0.006], [0.002, 0.005, -0.010]])
 ARM_MM = np.array([1.5, -1.0, 1.2])
-DELAY_S = 2e-4
+DELAY_S, RATE = 2e-4, 1e-4
 NOTHING = np.zeros((3, 3))
 
 
@@ -66,11 +66,14 @@ def as_the_camera_sees(run, t_s, R, p_m, arm_m):
 
 
 def test_errors_of_both_sensors_are_found_to_within_what_is_said_of_them():
-    truth = np.concatenate([np.zeros(21), GYRO.ravel(), ACC.ravel(), ARM_MM * 1e-3, [DELAY_S]])
+    truth = np.concatenate([np.zeros(21), GYRO.ravel(), ACC.ravel(), ARM_MM * 1e-3, [DELAY_S, RATE]])
     shaken = simulate_two_imus(1, duration_s=6.0)
     run, nodes, build = problem_of(shaken, with_wrong_camera_sensor(shaken), ARM_MM)
-    late = CameraErrors(delay_s=2.5e-3 - DELAY_S - run.camera.delay_s)  # simulated: 6.5 ms less 4 ms
-    run = run.with_sensor(SensorErrors(NOTHING, NOTHING, np.zeros(3), np.zeros((43, 43)), camera=late))
+    # Simulated: 6.5 ms less 4 ms, by one clock.
+    late = CameraErrors(
+        delay_s=2.5e-3 - DELAY_S - run.camera.delay_s, delay_rate=-RATE - run.camera.delay_rate
+    )
+    run = run.with_sensor(SensorErrors(NOTHING, NOTHING, np.zeros(3), np.zeros((44, 44)), camera=late))
     problem = build(run)
     errors = estimate_sensor_errors(
         problem, Filter(problem), 0, FusionSettings(), R_still_camera=nodes.camera_attitudes(run)
@@ -81,7 +84,7 @@ def test_errors_of_both_sensors_are_found_to_within_what_is_said_of_them():
     assert sd[42] < 0.2 * FusionSettings().camera_delay_sd_ns * 1e-9
     assert sd[39:42].max() < 0.8e-3  # rocking by 2 degrees shows the arm
     assert sd[21:39].mean() < 0.6 * FusionSettings().sensor_gain_sd
-    # 43 numbers, correlated: their mean square is 1 when honest.
+    # 44 numbers, correlated: their mean square is 1 when honest.
     assert 0.3 < np.mean(np.square((found - truth) / sd)) < 2.0
 
 
@@ -97,19 +100,28 @@ def test_what_is_carried_along_is_the_derivative_of_the_relative_motion():
     R, p_m = as_the_camera_sees(
         run, nodes.t_s, estimate.state.R[:n, 0], estimate.state.x[:n, 0, POS], run.lever_arm_m
     )
-    for error, size in ((0, 1e-3), (5, 1e-3), (9, 1e-3), (13, 1e-3), (18, 1e-4), (20, 1e-4), (21, 1e-5)):
-        value = np.zeros(22)
+    for error, size in (
+        (0, 1e-3),
+        (5, 1e-3),
+        (9, 1e-3),
+        (13, 1e-3),
+        (18, 1e-4),
+        (20, 1e-4),
+        (21, 1e-5),
+        (22, 1e-5),
+    ):
+        value = np.zeros(N_CAMERA_ERRORS)
         value[error] = size
         taken = CameraErrors.of(value)
         changed = run.with_sensor(
-            SensorErrors(NOTHING, NOTHING, np.zeros(3), np.zeros((43, 43)), camera=taken)
+            SensorErrors(NOTHING, NOTHING, np.zeros(3), np.zeros((44, 44)), camera=taken)
         )
         again = Filter(build(changed)).smooth(SEEN).state
         R_now, p_now = as_the_camera_sees(
             changed, nodes.t_s, again.R[:n, 0], again.x[:n, 0, POS], run.lever_arm_m
         )
         turn = Rotation.from_matrix(np.swapaxes(R, 1, 2) @ R_now).as_rotvec()
-        one = np.zeros((43, 43))
+        one = np.zeros((44, 44))
         one[21 + error, 21 + error] = 1.0
         more = (
             with_sensor_doubt(
@@ -167,7 +179,7 @@ def test_the_poses_in_still_axes_follow_a_change_of_the_sensor(kind):
     )
     run = prepare_run(item, FusionSettings())
     errors = SensorErrors(
-        NOTHING, NOTHING, np.zeros(3), np.zeros((43, 43)), camera=CameraErrors(GYRO, ACC, ARM_MM * 1e-3)
+        NOTHING, NOTHING, np.zeros(3), np.zeros((44, 44)), camera=CameraErrors(GYRO, ACC, ARM_MM * 1e-3)
     )
     changed = run.with_sensor(errors)
     R, p_m = as_the_camera_sees(changed, run.aligned_s(), changed.R_seen, changed.p_seen_m, np.zeros(3))

@@ -186,6 +186,10 @@ class Run:
         """Return IMU time of camera time at the linearisation point."""
         return np.asarray(t_cam_s + lin.tau_s + lin.skew * (t_cam_s - self.t_mid_s))
 
+    def camera_time_s(self, t_s: FloatArray, lin: Linearisation) -> FloatArray:
+        """Return camera time of IMU time at the linearisation point."""
+        return np.asarray((t_s - lin.tau_s + lin.skew * self.t_mid_s) / (1 + lin.skew))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nodes:
@@ -356,7 +360,7 @@ def build_problem(
         pr.R_seen[at, b], pr.p_seen_m[at, b] = run.R_seen, run.p_seen_m
         scale = np.repeat(noise_scale[b], 3)
         pr.cov_seen[at, b] = run.cov_seen * scale[:, None] * scale
-        pr.since_mid_s[at, b] = run.t_cam_s - run.t_mid_s
+        pr.since_mid_s[: k + 1, b] = run.camera_time_s(node.t_s, lin) - run.t_mid_s
         pr.start.R[b] = lin.R_first
         x = pr.start.x[b]
         x[POS], x[VEL], x[BG], x[GRAV] = lin.p_first_m, lin.v_first_mps, lin.bg_radps, lin.gravity_mps2

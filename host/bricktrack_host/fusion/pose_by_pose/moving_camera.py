@@ -108,6 +108,7 @@ class CameraMotion:
             bias_radps=bias,
             attitude=Attitude(signal, bias),
             delay_s=self.delay_s + errors.delay_s,
+            delay_rate=self.delay_rate + errors.delay_rate,
             imu_to_camera_m=self.imu_to_camera_m + errors.arm_m,
             errors=CameraErrors.of(self.errors.values() + errors.values()),
         )

@@ -1,10 +1,10 @@
 """Errors of the sensor at a moving camera that stand still, and how the relative motion depends on them.
 
-They are those of any inertial sensor (`sensor_errors`), scale, crossed axes and place; and its clock's delay
-against the brick's. Its gyro makes the axes that stand still (`pose_by_pose.moving_camera`), so an error of
-its gain turns these by what that error makes of the camera's rocking, and with them all that is seen and the
-force felt. Its accelerometer's errors act on the velocity. Its place acts on what is seen alone. Its delay
-turns the axes by the camera's rate, and takes the force from another instant.
+They are those of any inertial sensor (`sensor_errors`), scale, crossed axes and place; and its clock's, delay
+and rate against the brick's. Its gyro makes the axes that stand still (`pose_by_pose.moving_camera`), so an
+error of its gain turns these by what that error makes of the camera's rocking, and with them all that is seen
+and the force felt. Its accelerometer's errors act on the velocity. Its place acts on what is seen alone. Its
+delay turns the axes by the camera's rate, and takes the force from another instant.
 """
 
 from dataclasses import dataclass, field
@@ -16,8 +16,8 @@ from bricktrack_common.rotations import skew
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.smoothing.smoother import ATT, POS, Problem
 
-N_CAMERA_ERRORS = 22
-GYRO, ACC, ARM, DELAY = slice(0, 9), slice(9, 18), slice(18, 21), 21
+N_CAMERA_ERRORS = 23
+GYRO, ACC, ARM, DELAY, RATE = slice(0, 9), slice(9, 18), slice(18, 21), 21, 22
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,31 +30,33 @@ class CameraErrors:
         Sample = (1 + this) @ truth, to first order.
     arm_m : ndarray, shape (3,), camera axes
         True way from the sensor to the projection centre less the one given.
-    delay_s : float
-        By how much it stamps later than the brick's sensor, less what was believed.
+    delay_s, delay_rate : float
+        By how much it stamps later than the brick's sensor in the run's middle, and how fast that grows, less
+        what was believed.
     """
 
     gyro: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     acc: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     arm_m: FloatArray = field(default_factory=lambda: np.zeros(3))
     delay_s: float = 0.0
+    delay_rate: float = 0.0
 
     @classmethod
     def of(cls, values: FloatArray) -> "CameraErrors":
-        """Return them from one vector, shape (22,): gyro and acc, row by row, arm, delay."""
-        return cls(
-            values[GYRO].reshape(3, 3), values[ACC].reshape(3, 3), values[ARM].copy(), float(values[DELAY])
-        )
+        """Return them from one vector, shape (23,): gyro and acc, row by row, arm, delay and its rate."""
+        gyro, acc = values[GYRO].reshape(3, 3), values[ACC].reshape(3, 3)
+        return cls(gyro, acc, values[ARM].copy(), float(values[DELAY]), float(values[RATE]))
 
     def values(self) -> FloatArray:
-        """Return them as one vector, shape (22,)."""
-        return np.concatenate([self.gyro.ravel(), self.acc.ravel(), self.arm_m, [self.delay_s]])
+        """Return them as one vector, shape (23,)."""
+        clock = [self.delay_s, self.delay_rate]
+        return np.concatenate([self.gyro.ravel(), self.acc.ravel(), self.arm_m, clock])
 
 
 def camera_prior_sd(settings: FusionSettings) -> FloatArray:
-    """Return what is believed of their sizes before a run speaks, shape (22,)."""
-    sizes = [settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3, settings.camera_delay_sd_ns * 1e-9]
-    return np.repeat(sizes, [18, 3, 1])
+    """Return what is believed of their sizes before a run speaks, shape (23,)."""
+    clock = [settings.camera_delay_sd_ns * 1e-9, settings.camera_delay_rate_sd]
+    return np.append(np.repeat([settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3], [18, 3]), clock)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,9 +68,9 @@ class CameraWay:
     t_s : ndarray, shape (K,)
         After the first node.
     R_still_camera : ndarray, shape (K, 3, 3)
-    turned : ndarray, shape (K, 3, 22)
+    turned : ndarray, shape (K, 3, 23)
         By how much the errors have turned the still axes, in still axes, rad.
-    velocity : ndarray, shape (K - 1, 3, 22), m/s
+    velocity : ndarray, shape (K - 1, 3, 23), m/s
         Change in each step.
     """
 
@@ -88,15 +90,16 @@ class CameraWay:
         rate = np.einsum("kri,km->krim", R, omega).reshape(-1, 3, 9)
         turned = np.zeros((len(R), 3, N_CAMERA_ERRORS))
         turned[1:, :, GYRO] = np.cumsum(0.5 * dt[:, None, None] * (rate[1:] + rate[:-1]), axis=0)
-        turned[..., DELAY] = -still
+        since_mid = problem.since_mid_s[:, b, None]
+        turned[..., DELAY], turned[..., RATE] = -still, -still * since_mid
         felt = problem.known[:, b, 0]  # minus the force's integral
         middle = 0.5 * (R[1:] + R[:-1])
         in_camera = np.einsum("kji,kj->ki", middle, felt)
         velocity = skew(felt) @ (0.5 * (turned[1:] + turned[:-1]))
         velocity[..., ACC] = -np.einsum("kri,km->krim", middle, in_camera).reshape(-1, 3, 9)
-        velocity[..., DELAY] = _over_step(
-            np.divide(felt, dt[:, None], out=np.zeros_like(felt), where=dt[:, None] > 0)
-        )
+        force = np.divide(felt, dt[:, None], out=np.zeros_like(felt), where=dt[:, None] > 0)
+        velocity[..., DELAY] = _over_step(force)
+        velocity[..., RATE] = velocity[..., DELAY] * 0.5 * (since_mid[1:] + since_mid[:-1])
         return cls(np.concatenate([[0.0], np.cumsum(dt)]), R, turned, velocity)
 
     def at(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -110,7 +113,7 @@ class CameraWay:
         return R, turned
 
     def of_seen(self, R_still_brick: FloatArray, p_still_m: FloatArray, t_s: FloatArray) -> FloatArray:
-        """Return by how much taking them out moves poses seen at instants, shape (n, 6, 22)."""
+        """Return by how much taking them out moves poses seen at instants, shape (n, 6, 23)."""
         R_still_camera, turned = self.at(t_s)
         own = np.empty((len(t_s), 6, N_CAMERA_ERRORS))
         own[:, :3] = -np.swapaxes(R_still_brick, 1, 2) @ turned
@@ -119,7 +122,7 @@ class CameraWay:
         return own
 
     def of_output(self, R_still_brick: FloatArray, p_still_m: FloatArray, of: IntArray) -> FloatArray:
-        """Return what they change between the states ``of`` and the motion as the camera sees it, (K, c, 22).
+        """Return what they change between the states ``of`` and the motion as the camera sees it, (K, c, 23).
 
         The camera is turned and shifted in the still axes; the states are told in these.
         """

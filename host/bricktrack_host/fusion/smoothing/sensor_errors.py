@@ -44,7 +44,7 @@ class SensorErrors:
         Sample = (1 + this) @ truth, to first order.
     arm_m : ndarray, shape (3,), brick axes
         True lever arm less the one given.
-    covariance : ndarray, shape (21, 21), or (43, 43) where the camera moves
+    covariance : ndarray, shape (21, 21), or (44, 44) where the camera moves
         Of gyro and acc, row by row, and arm_m; and of the camera's sensor, see `CameraErrors.values`.
     camera : CameraErrors or None
         Of the sensor that moves with the camera.
@@ -154,7 +154,7 @@ def with_sensor_doubt(
 ) -> Estimate:
     """Return smoothed states with what the errors of the sensors leave unsure added to their covariance.
 
-    ``sensor_covariance``: of each run of the batch, shape (21, 21), or (43, 43) where the camera moves; zero
+    ``sensor_covariance``: of each run of the batch, shape (21, 21), or (44, 44) where the camera moves; zero
     where all is known. ``R_still_camera``: as `estimate_sensor_errors`, of each run whose camera moves.
     """
     covariance, variance = estimate.covariance.copy(), estimate.variance.copy()

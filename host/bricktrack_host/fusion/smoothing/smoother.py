@@ -53,7 +53,7 @@ class Problem:
     R_seen, p_seen_m, cov_seen : ndarray, shape (K, B, 3, 3), (K, B, 3), (K, B, 6, 6)
         Optical poses of the brick's origin; covariance of [dtheta rad, dt m].
     since_mid_s : ndarray, shape (K, B)
-        Camera time of the frame less that of the run's middle.
+        Camera time of the node, or its frame, less that of the run's middle.
     lever_arm_m : ndarray, shape (B, 3)
     bg_lin, ba_lin : ndarray, shape (B, 3)
     tau_lin, skew_lin, lag_lin, loss_lin : ndarray, shape (B,)
