@@ -4,7 +4,7 @@ What calibration, layout and profile leave of error in a centroid hardly changes
 few millimetres. Taken for noise it would average out over the frames, as it does not; taken for nothing the
 noise would be overstated. So a centroid's error is a noise that is new in every picture, and a part that
 stands still: of the profile and of the picture's size, common to all LEDs, and of each LED for itself. How
-large the latter is the run itself says, by the likelihood of its residuals.
+large the latter is the LEDs say among themselves (`leds_among_themselves`).
 
 Like the errors of the inertial sensor (`sensor_errors`, which see for the method) these need not be states of
 the filter: one weighted least squares over the run gives them, and what stays unsure of them makes the motion
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import Pictured, SeenLeds
+from bricktrack_host.fusion.led_by_led.leds_among_themselves import AmongThemselves
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
 from bricktrack_host.fusion.smoothing.camera_errors import (
     N_CAMERA_ERRORS,
@@ -49,7 +50,7 @@ _STAND_SD = 0.5  # of an error: what is not yet taken out of the motion is not i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandingErrors:
-    """Errors that stand still, in one vector of q = 23 + 2 L, or 45 + 2 L where the camera moves.
+    """Errors that stand still, in one vector of q = 23 + 2 L, or 46 + 2 L where the camera moves.
 
     In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
     the profile's, in units of its stated sd; the picture's size over what it should be, less 1; (u, v) of
@@ -110,7 +111,7 @@ class StandingPrior:
         Zero where none are believed.
     led_shift_px : ndarray, shape (L, 2)
         One standard deviation of each LED's profile, of which a share is its own.
-    camera_sd : ndarray, shape (22,), or (0,) where the camera stands still
+    camera_sd : ndarray, shape (23,), or (0,) where the camera stands still
     """
 
     sensor_sd: FloatArray
@@ -178,6 +179,10 @@ class StandingWay:
         self._camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, 0)
         own = _own_part(problem, leds, pictured, n_leds, self._camera)
         further = np.zeros((n_nodes - 1, 3, 0)) if self._camera is None else self._camera.velocity
+        if problem.leds is None:
+            raise ValueError("the problem has no LEDs")
+        pictures = -own[:, :, _PROFILE : _FIRST_LED + 2 * n_leds]
+        self._among_themselves = AmongThemselves.of(problem.leds, leds, pictures)
         q, c = own.shape[2], len(of)
         self._run, self._of, self._R = passed.runs[0], of, np.empty((n_nodes, 3, 3))
         self._rows, self._changed = np.empty((n_nodes, c, N_STATES)), np.empty((n_nodes, c, q))
@@ -193,17 +198,19 @@ class StandingWay:
     def estimate(self, prior: StandingPrior, known: FloatArray) -> StandingErrors:
         """Return the likeliest errors and their covariance, where ``known``, shape (q,), was taken out.
 
-        The sd of single LEDs' errors is the root of its mean square given the run's residuals.
+        The sd of single LEDs' errors is the root of its mean square given what they say among themselves.
         """
         dy, y = self._dy.reshape(-1, self._dy.shape[2]), self._y.ravel()
         normal, pull = dy.T @ dy, dy.T @ y
-        belief = _likeliest(prior.covariance(_OFFSET_SDS_PX), known, normal, pull)[0]
+        n_leds = len(prior.led_shift_px)
+        part = slice(_PROFILE, _FIRST_LED + 2 * n_leds)
+        of_pictures = prior.covariance(_OFFSET_SDS_PX)[:, part, part]
+        belief = self._among_themselves.belief(of_pictures, known[part])
         weight = np.exp(belief - belief.max())
         offset_sd_px = float(np.sqrt((weight * _OFFSET_SDS_PX**2).sum() / weight.sum()))
         believed = prior.covariance(offset_sd_px)
         _, value = _likeliest(believed, known, normal, pull)
         covariance = np.linalg.solve(np.eye(len(known)) + believed @ normal, believed)
-        n_leds = len(prior.led_shift_px)
         return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px, n_leds)
 
     def with_doubt(self, estimate: Estimate, errors: StandingErrors) -> Estimate:
