@@ -10,6 +10,7 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
+from bricktrack_host.fusion.pose_by_pose.sampling_kernel import covariance_between
 from bricktrack_host.fusion.smoothing.covariance_kernel import are_definite
 from bricktrack_host.fusion.smoothing.smoother import (
     BA,
@@ -62,12 +63,10 @@ def sample_motion(
     R_out, p_out, H = observe(
         at.state, at.omega_radps, run.lever_arm_m, at.t_cam_s - run.t_mid_s, zero, camera_omega_radps=camera
     )
-    H = H[..., estimate.of]
-    cov = estimate.covariance[at.node, b]
-    if is_smoothed:
-        a = at.share[:, None, None]
-        cov = (1 - a) * cov + a * estimate.covariance[at.node + 1, b]
-    P = H @ cov @ np.swapaxes(H, 1, 2)
+    P = covariance_between(
+        np.ascontiguousarray(estimate.covariance[:, b]), at.node, at.share if is_smoothed else zero,
+        np.ascontiguousarray(H[..., estimate.of]),
+    )  # fmt: skip
     _add_bridge(P, problem, b, at, is_smoothed=is_smoothed)
     P = P + common
     R_t, omega = at.state.R, at.omega_radps

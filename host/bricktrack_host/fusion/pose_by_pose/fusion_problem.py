@@ -367,3 +367,11 @@ def build_problem(
         x[TAU], x[SKEW] = run.alignment.offset_ns * 1e-9, run.alignment.skew
         x[LAG] = settings.acc_lag_ns * 1e-9
     return pr, parts
+
+
+def with_frames_used(problem: Problem, nodes: list[Nodes], used: list[BoolArray]) -> Problem:
+    """Return the same arrays with other frames shown to the filter, shape (n_frames,) of each run."""
+    has_frame = np.zeros_like(problem.has_frame)
+    for b, (node, of_run) in enumerate(zip(nodes, used, strict=True)):
+        has_frame[node.node_of_frame, b] = of_run
+    return replace(problem, has_frame=has_frame)

@@ -18,6 +18,7 @@ from bricktrack_host.fusion.pose_by_pose.fusion_problem import (
     build_problem,
     first_linearisation,
     place_nodes,
+    with_frames_used,
 )
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.pose_by_pose.noise_choice import frame_chi2, settle_noise
@@ -104,10 +105,10 @@ def smooth_poses(
     lins = [relinearised(runs[b], first.estimate, b, len(nodes[b].t_s), settings) for b in range(len(runs))]
     runs = [run.with_acc_loss(lin.loss_s2).seen_at(lin) for run, lin in zip(first.runs, lins, strict=True)]
     nodes = [place_nodes(run, lin) for run, lin in zip(runs, lins, strict=True)]
+    problem, _ = build_problem(
+        runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
+    )
     for is_last in [False] * (_LAST_PASSES - 1) + [True]:
-        problem, _ = build_problem(
-            runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
-        )
         passed = Filter(problem)
         estimate = passed.smooth()
         chi2 = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
@@ -115,6 +116,7 @@ def smooth_poses(
         if is_last or all(np.array_equal(u, j) for u, j in zip(used, judged, strict=True)):
             break
         used = judged
+        problem = with_frames_used(problem, nodes, used)
     estimate = with_sensor_doubt(
         problem, passed, estimate, [run.sensor_covariance for run in runs],
         R_still_camera=[node.camera_attitudes(run) for node, run in zip(nodes, runs, strict=True)],
