@@ -1,7 +1,8 @@
-"""What it costs in accuracy that the motion within frames is fused without choosing the noise of the samples.
+"""What it costs in accuracy that the motion within frames is fused by a plainer model than that of the whole run.
 
 `process` solves its poses twice: the second time each LED is carried to its frame's instant by a first fusion. That
-one believes the samples as far as is stated; here it stands beside one that chooses. Simulated runs of a unit
+one takes the sensors for exact and believes the samples as far as is stated; here it stands beside one that estimates
+the sensors' standing errors, and one that chooses the noise too. Simulated runs of a unit
 (`tests/support/daemon_runs.py`) at 0.3 m/s, with impacts and dropouts; position errors in mm, of the poses that come
 of it and of the pose-level fusion of these.
 
@@ -33,6 +34,7 @@ from bricktrack_host.tracking.pose.frame_motion import led_motion
 CHOICES = {
     "noise chosen": FusionSettings(),
     "noise as stated": FusionSettings(adapt_noise=False),
+    "sensors exact": FusionSettings(adapt_noise=False, sensor_gain_sd=0.0, lever_arm_sd_mm=0.0),
 }
 
 

@@ -17,6 +17,7 @@ from bricktrack_host.fusion.optical.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.pose_by_pose.fused_output import unsure_times
 from bricktrack_host.fusion.sensor_agreement import doubt_about_camera_sensor
 from bricktrack_host.fusion.tight import fuse_tight
+from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.daq_clock import EdgeFit
 from bricktrack_host.results.ray_errors import RayErrors
 from bricktrack_host.results.result_tables import FusedKind
@@ -28,9 +29,9 @@ from bricktrack_host.tracking.pose.refine import LedMotion
 from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1
-# How far samples are to be believed decides about dropouts and impacts. Within a frame's 20 ms it changes
-# little: simulated, the fused error is under 1 % more than with the noise chosen (`scripts/bench_retime.py`).
-_WITHIN_FRAMES = FusionSettings(adapt_noise=False)
+# How far samples are to be believed, and how far their scales are off, decides about dropouts and impacts.
+# Within a frame's 20 ms it changes nothing that can be seen (`scripts/bench_retime.py`).
+_WITHIN_FRAMES = FusionSettings(adapt_noise=False, sensor_gain_sd=0.0, lever_arm_sd_mm=0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,3 +251,20 @@ def with_unsure_times(
         spread, flags = unsure_times(track.t_ns, frames_ns, time_sd_ns, velocity)
         widened[kind] = replace(track, covariance=track.covariance + spread, flags=track.flags | flags)
     return optical, widened
+
+
+def with_restamped_told(
+    optical: OpticalTrack, fused: dict[FusedKind, FusedTrack]
+) -> dict[FusedKind, FusedTrack]:
+    """Return the fused motion flagged at frames whose stamps were mended, and between two of them."""
+    is_restamped = optical.flags & int(PoseFlag.RESTAMPED) != 0
+    if not is_restamped.any():
+        return fused
+    last = len(optical.t_ns) - 1
+    told: dict[FusedKind, FusedTrack] = {}
+    for kind, track in fused.items():
+        before = np.clip(np.searchsorted(optical.t_ns, track.t_ns, side="right") - 1, 0, last)
+        after = np.clip(np.searchsorted(optical.t_ns, track.t_ns, side="left"), 0, last)
+        between = is_restamped[before] & is_restamped[after]
+        told[kind] = replace(track, flags=track.flags | np.where(between, int(PoseFlag.RESTAMPED), 0))
+    return told
