@@ -303,7 +303,7 @@ def _alignment(result: RunResult, panels: TimePanels) -> list[tuple[PlotSection,
         made.append(panel)
     words = (
         "The gyroscope's mean between two frames, less its offset, less the optical rate, once aligned. What "
-        " follows the motion here is a time offset that is left."
+        "follows the motion here is a time offset that is left."
     )
     return [(PlotSection("alignment", "Camera and inertial sensor", words), panels.grid(made))]
 
@@ -374,6 +374,7 @@ def _spectra(result: RunResult) -> list[tuple[PlotSection, GridPlot]]:
         legend_that_hides(panel, marks)
         made.append(panel)
     words = (
-        "Amplitude density of the motion. Dotted: half the frame rate; beyond it frames alone tell nothing."
+        "Amplitude density of the motion. Dotted: half the mean rate of the frames; beyond it frames alone "
+        "tell nothing."
     )
     return [(PlotSection("spectra", "Spectra", words), grid(made, columns=2))]

@@ -214,9 +214,9 @@ def spectrum_chart(result: RunResult) -> Chart | None:
 
 
 def half_frame_rate_hz(result: RunResult) -> float | None:
-    """Return the frequency up to which frames alone can tell motion, by the configured frame rate."""
-    camera = result.manifest.camera
-    return 0.5e6 / camera.frame_duration_us if camera and camera.frame_duration_us > 0 else None
+    """Return the frequency up to which frames alone can tell motion: half their mean rate, drops included."""
+    stamps_ns = result.observations.sensor_timestamp_ns
+    return 0.5e9 * (len(stamps_ns) - 1) / float(stamps_ns[-1] - stamps_ns[0]) if len(stamps_ns) > 1 else None
 
 
 def six_components(

@@ -143,7 +143,7 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
             embed_chart(
                 spectrum,
                 "Spectra of displacement and rotation",
-                "Amplitude density of the fused motion. Dotted: half the frame rate.",
+                "Amplitude density of the fused motion. Dotted: half the mean rate of the frames.",
             )
         )
     return section

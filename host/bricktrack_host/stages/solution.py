@@ -27,7 +27,14 @@ from bricktrack_host.stages.clocks import (
     with_stamps_mended,
 )
 from bricktrack_host.stages.details import alignment_details, calibration_details
-from bricktrack_host.stages.motion import fuse_run, output_grid, retime, with_ray_errors, with_unsure_times
+from bricktrack_host.stages.motion import (
+    fuse_run,
+    output_grid,
+    retime,
+    with_ray_errors,
+    with_restamped_told,
+    with_unsure_times,
+)
 from bricktrack_host.stages.progress import Stages
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
@@ -108,6 +115,7 @@ def solve_run(
         seen = (observations, rays) if settings.rolling_shutter else None
         fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
         optical, fused = with_unsure_times(optical, fused, time_sd_ns)
+        fused = with_restamped_told(optical, fused)
         errors_of_rays = ray_errors(calibration.ray_model, brick, _pose_at_rest(optical, rest))
         if errors_of_rays is None:
             problems.append(

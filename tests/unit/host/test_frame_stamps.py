@@ -12,7 +12,7 @@ from bricktrack_host.fusion.clocks.stamp_regularity import stamp_regularity
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.pose_by_pose.fused_output import unsure_times
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.stages.motion import with_unsure_times
+from bricktrack_host.stages.motion import with_restamped_told, with_unsure_times
 from bricktrack_host.tracks import FusedTrack
 
 PERIOD_NS = 31_250_000  # 32 Hz: a whole number of the simulation's 4 kHz steps
@@ -252,3 +252,15 @@ def test_only_what_is_unsure_is_widened(shake):
         assert grown[50] == pytest.approx(0.9 * np.hypot(1, 0.3))
         assert np.flatnonzero(grown > 1e-9).tolist() == [50]
         assert np.flatnonzero(after.flags & PoseFlag.UNSURE_TIME).tolist() == [50]
+
+
+def test_fused_motion_between_mended_frames_is_told_as_they_are(shake):
+    mended = np.zeros(len(shake.optical.t_ns), dtype=bool)
+    mended[[20, 21, 40]] = True
+    optical = replace(shake.optical, flags=shake.optical.flags | np.where(mended, int(PoseFlag.RESTAMPED), 0))
+    t_ns = np.unique(np.concatenate([optical.t_ns, optical.t_ns[:-1] + PERIOD_NS // 3]))
+    fused = {"imu": still_moving(t_ns, np.zeros((len(t_ns), 3)))}
+    told = with_restamped_told(optical, fused)["imu"]
+    expected = [optical.t_ns[20], optical.t_ns[20] + PERIOD_NS // 3, optical.t_ns[21], optical.t_ns[40]]
+    assert t_ns[told.flags & int(PoseFlag.RESTAMPED) != 0].tolist() == expected
+    assert with_restamped_told(shake.optical, fused) is fused

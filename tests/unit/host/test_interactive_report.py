@@ -19,6 +19,7 @@ from bricktrack_host.reporting.combined_interactive import render_interactive_te
 from bricktrack_host.reporting.combined_report import read_combined_test
 from bricktrack_host.reporting.interactive_panels import MAX_SAMPLES, samples
 from bricktrack_host.reporting.interactive_report import banded, render_interactive_report
+from bricktrack_host.reporting.plots import half_frame_rate_hz
 from bricktrack_host.results.run_summary import key_figures
 
 from .test_report import changed
@@ -202,3 +203,16 @@ def test_the_command_writes_each_page_where_it_says(lab, tmp_path):
     empty.mkdir()
     assert report(empty)[0] == 1
     shutil.rmtree(empty)
+
+
+def test_half_the_frame_rate_is_that_of_the_frames_there_are(result):
+    seen = result.observations
+    stamps_ns = np.arange(0, 9_000_000_000, 25_000_000, dtype=np.int64)  # 40 Hz
+    kept_ns = np.delete(stamps_ns, np.arange(3, len(stamps_ns) - 1, 4))  # every fourth dropped
+    for stamps, half_hz in ((stamps_ns, 20.0), (kept_ns, 15.0)):
+        given = replace(result, observations=replace(seen, sensor_timestamp_ns=stamps))
+        assert half_frame_rate_hz(given) == pytest.approx(half_hz, rel=0.01)  # ends count by one frame
+    assert (
+        half_frame_rate_hz(replace(result, observations=replace(seen, sensor_timestamp_ns=stamps_ns[:1])))
+        is None
+    )
