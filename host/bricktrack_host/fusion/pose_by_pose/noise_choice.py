@@ -157,6 +157,8 @@ def _with_known_sensors(
     settings: FusionSettings,
 ) -> tuple[list[Run], list[Linearisation]]:
     """Return runs without the errors of their sensors that stand still, as a first pass finds them."""
+    if not (settings.sensor_gain_sd or settings.lever_arm_sd_mm):
+        return runs, lins
     problem, _ = build_problem(
         runs, nodes, lins, settings=settings, use_frame=used,
         noise_scale=[np.ones(2) for _ in runs], levels=levels,
