@@ -12,6 +12,9 @@ from bricktrack_host.fusion.smoothing.linearisation import Linearisation
 
 _ONE_MISSING = 2.5  # periods between samples above which more than one is missing
 _NOISE_POINTS = 4  # of a step, over which its noise is averaged
+# Weights of neighbours. What is in proportion to a vibration turns its sign with it, before it adds up: at
+# 100 Hz this keeps 0.88 of what moves at 8 Hz, and 0.02 of what shakes at 37 Hz.
+_SMOOTH = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +29,8 @@ class NoiseParts:
     gyro_rough, acc_rough
         Steady roughness beyond the sensor's own noise, at a share of 1.
     gyro_systematic, acc_systematic
-        Scale and lever-arm errors in proportion to the motion, which keep their sign for a while.
+        Scale and lever-arm errors in proportion to the motion, which keep their sign for a while; those of a
+        vibration do not, and are left out.
     """
 
     gyro_fixed: FloatArray
@@ -68,11 +72,12 @@ def noise_parts(
 ) -> NoiseParts:
     """Return how far the inertial signal is to be trusted over the steps between instants of IMU time."""
     s, period, hold = settings, signal.period_s, settings.systematic_time_s
-    gyro = signal.gyro_radps - lin.bg_radps
+    gyro = _without_vibration(signal.gyro_radps - lin.bg_radps)
     turn = np.linalg.norm(np.gradient(gyro, signal.t_s, axis=0), axis=1)
     size = np.linalg.norm(gyro, axis=1)
     # What of the force is not constant in the body: the constant part is the bias state's.
-    moving = np.linalg.norm(signal.acc_mps2 - np.median(signal.acc_mps2, axis=0), axis=1)
+    force = _without_vibration(signal.acc_mps2)
+    moving = np.linalg.norm(force - np.median(force, axis=0), axis=1)
     arm_m = s.lever_arm_sd_mm * 1e-3
 
     points = t_s[:-1] + np.diff(t_s, axis=0) * ((np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS)[:, None]
@@ -107,6 +112,13 @@ def noise_parts(
         acc_rough=at(acc_rough * period, lin.lag_s),
         acc_systematic=at(acc_systematic * hold, lin.lag_s),
     )
+
+
+def _without_vibration(values: FloatArray) -> FloatArray:
+    """Return a signal, shape (n, 3), without what is faster than bricks move."""
+    side = len(_SMOOTH) // 2
+    padded = np.pad(values, ((side, side), (0, 0)), mode="edge")
+    return np.stack([np.convolve(axis, _SMOOTH, "valid") for axis in padded.T], axis=1)
 
 
 def camera_noise(

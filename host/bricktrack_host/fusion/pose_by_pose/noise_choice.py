@@ -29,7 +29,7 @@ from bricktrack_host.fusion.smoothing.smoother import (
 
 _LEVEL_STEP = 2.5  # between the noise levels that a run may choose from
 _LEAST_SYSTEMATIC, _MOST_SYSTEMATIC = -6, 2  # steps: from a 250th of what is stated to six times that
-_LEAST_ROUGH = -4
+_LEAST_ROUGH = -8  # of a vibration at one pitch next to nothing is left once it is integrated
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from the stated level must earn
 _MAX_SCALE_ROUNDS = 4
 _SCALE_STANDS = 1.25
@@ -122,7 +122,8 @@ def settle_noise(
     stated = NoiseLevel(settings.roughness_share, 1.0)
     levels = levels or [(stated, stated) for _ in runs]
     scales = [np.ones(2) for _ in runs]
-    runs, lins = _with_known_sensors(runs, lins, nodes, used, levels, settings)
+    as_given, found_by = runs, levels
+    runs = _with_known_sensors(runs, lins, nodes, used, levels, settings)
     for _ in range(_MAX_SCALE_ROUNDS):
         problem, parts = build_problem(
             runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
@@ -131,6 +132,10 @@ def settle_noise(
             levels, last = _choose_noise(problem, parts, settings)
             # What stands still is known by now: the accelerometer is taken as it is from here on.
             lins = [_with_sensors(lin, x) for lin, x in zip(lins, last, strict=True)]
+            if levels != found_by:
+                # By samples believed to vibrate as much as they are rough, hardly an error is found.
+                runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(as_given, lins, strict=True)]
+                runs, found_by = _with_known_sensors(runs, lins, nodes, used, levels, settings), levels
             runs = [run.with_acc_loss(lin.loss_s2) for run, lin in zip(runs, lins, strict=True)]
             problem, _ = build_problem(
                 runs, nodes, lins, settings=settings, use_frame=used, noise_scale=scales, levels=levels
@@ -155,10 +160,10 @@ def _with_known_sensors(
     used: list[BoolArray],
     levels: list[tuple[NoiseLevel, NoiseLevel]],
     settings: FusionSettings,
-) -> tuple[list[Run], list[Linearisation]]:
+) -> list[Run]:
     """Return runs without the errors of their sensors that stand still, as a first pass finds them."""
     if not (settings.sensor_gain_sd or settings.lever_arm_sd_mm):
-        return runs, lins
+        return runs
     problem, _ = build_problem(
         runs, nodes, lins, settings=settings, use_frame=used,
         noise_scale=[np.ones(2) for _ in runs], levels=levels,
@@ -170,7 +175,7 @@ def _with_known_sensors(
             problem, passed, b, settings, R_still_camera=nodes[b].camera_attitudes(run)
         )
         known.append(run if errors is None else run.with_sensor(errors))
-    return known, lins
+    return known
 
 
 def _settled_scale(scale: FloatArray, done: bool) -> FloatArray:
