@@ -19,6 +19,7 @@ _NEAR = 0.25  # an edge further than this from its grid point, in periods, belon
 _MIN_CONCENTRATION = 0.6  # edges jittering uniformly over a quarter period still reach 0.9
 _MAX_EXTRA = 0.2
 _HUBER = 1.345  # 95 % efficiency on Gaussian jitter (Huber 1964)
+_STANDS_NS = 1e-3  # what a further round would move any edge by, when rounds end
 
 
 class EdgeFitError(BricktrackError, ValueError):
@@ -267,12 +268,16 @@ def _huber_line(index: IntArray, since_ns: FloatArray, period_ns: float) -> _Lin
     y = since_ns - index * period_ns  # small numbers: the fit keeps its digits
     weight = np.ones(index.size)
     slope = level = 0.0
+    reach = float(np.abs(x).max())
     for _ in range(20):
+        before = level, slope
         xm = float(np.average(x, weights=weight))
         ym = float(np.average(y, weights=weight))
         slope = float(np.sum(weight * (x - xm) * (y - ym)) / np.sum(weight * (x - xm) ** 2))
         level = ym - slope * xm
         residual = y - level - slope * x
+        if abs(level - before[0]) + abs(slope - before[1]) * reach < _STANDS_NS:
+            break
         sd = _robust_sd(residual)
         if sd == 0.0:
             break
