@@ -85,6 +85,17 @@ def import_recording(
         int | None,
         typer.Option("--exposure-us", min=1, help="Exposure time.", show_default=False, rich_help_panel=_RIG),
     ] = None,
+    exposures: Annotated[
+        Path | None,
+        typer.Option(
+            "--exposures",
+            help="Text file, one exposure time a picture, us, where they vary.",
+            exists=True,
+            dir_okay=False,
+            show_default=False,
+            rich_help_panel=_RIG,
+        ),
+    ] = None,
     line_time_us: Annotated[
         float | None,
         typer.Option(
@@ -195,6 +206,7 @@ def import_recording(
             imu_acc_range_g=imu_acc_range_g,
             imu_gyro_range_dps=imu_gyro_range_dps,
             edges=edges,
+            exposures=exposures,
             rig=loose,
             unit=unit,
             label=label,

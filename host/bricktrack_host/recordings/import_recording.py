@@ -38,6 +38,7 @@ from bricktrack_host.recordings.loose_files import (
     LooseRig,
     TimestampUnit,
     read_edges_csv,
+    read_exposures_us,
     read_imu_csv,
     read_timestamps,
 )
@@ -56,6 +57,8 @@ class Recording:
     imus : dict of str to Path
         CSV files by the sensor's name; ``"brick"`` is the one on the LED component.
     edges : Path or None
+    exposures : Path or None
+        Text file with each picture's exposure, us; without it all are the rig's.
     rig : LooseRig
     unit, label : str
         The run's id is ``<unit>_<label>``.
@@ -73,6 +76,7 @@ class Recording:
     simulated: bool
     imus: dict[str, Path] = field(default_factory=dict)
     edges: Path | None = None
+    exposures: Path | None = None
     timestamps_unit: TimestampUnit = "auto"
     imu_acc_range_g: float = 16.0
     imu_gyro_range_dps: float = 2000.0
@@ -111,6 +115,9 @@ def import_recording(recording: Recording, runs_folder: Path) -> Imported:
         raise StorageError(f"{folder} exists already. Choose another --label, or move that folder away")
     video = load_video(recording.video)
     stamps_us = read_timestamps(recording.timestamps, unit=recording.timestamps_unit)
+    exposures_us = np.full(len(stamps_us), recording.rig.exposure_us, dtype=np.int64)
+    if recording.exposures is not None:
+        exposures_us = read_exposures_us(recording.exposures, n_frames=len(stamps_us))
     mode = recording.rig.mode
     if (video.width, video.height) != (mode.width, mode.height):
         raise VideoError(
@@ -141,7 +148,7 @@ def import_recording(recording: Recording, runs_folder: Path) -> Imported:
             shutil.rmtree(part)  # of an import that was broken off; its sources are elsewhere
         part.mkdir()
         try:
-            records = _frame_records(recording, video, stamps_us[:n_frames])
+            records = _frame_records(recording, video, stamps_us[:n_frames], exposures_us)
             _write_streams(part, video, records, imus, edges_ns)
             manifest = _manifest(recording, run_id, part, video, records, imus, edges_ns, missing)
             write_manifest(part / MANIFEST_NAME, manifest)
@@ -213,21 +220,23 @@ def _check_container_times(
     )
 
 
-def _frame_records(recording: Recording, video: LooseVideo, stamps_us: IntArray) -> list[FrameRecord]:
+def _frame_records(
+    recording: Recording, video: LooseVideo, stamps_us: IntArray, exposures_us: IntArray
+) -> list[FrameRecord]:
     steps = np.diff(stamps_us, prepend=stamps_us[:1])
     period_us = float(np.median(steps[1:])) if len(steps) > 1 else np.inf
     return [
         FrameRecord(
             pts_us=int(stamp - stamps_us[0]),
             sensor_timestamp_ns=recording.rig.first_sensor_timestamp_ns + 1000 * int(stamp),
-            exposure_us=recording.rig.exposure_us,
+            exposure_us=int(exposure_us),
             analogue_gain=float("nan"),
             keyframe=unit.keyframe,
             byte_offset=unit.byte_offset,
             n_bytes=unit.n_bytes,
             flags=int(FrameFlag.GAP_BEFORE if step > _GAP_PERIODS * period_us else FrameFlag.NONE),
         )
-        for stamp, step, unit in zip(stamps_us, steps, video.units, strict=False)
+        for stamp, step, exposure_us, unit in zip(stamps_us, steps, exposures_us, video.units, strict=False)
     ]
 
 
@@ -277,7 +286,7 @@ def _manifest(
         camera=CameraSection(
             model="unknown (imported)",
             mode=recording.rig.mode,
-            exposure_us=recording.rig.exposure_us,
+            exposure_us=round(float(np.median([r.exposure_us for r in records]))),
             analogue_gain=0.0,  # 0 stands for not known: no camera has it
             colour_gains=(0.0, 0.0),
             frame_duration_us=round(period_us),

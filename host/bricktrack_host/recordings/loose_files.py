@@ -16,6 +16,7 @@ from bricktrack_host.recordings.timed_csv import TimedCsv, read_text
 
 TimestampUnit = Literal["auto", "us", "ms"]
 _MAX_FRAME_RATE_HZ = 1000.0
+_MAX_EXPOSURE_US = 1e6
 _ACC_COLUMNS = ("ax_mps2", "ay_mps2", "az_mps2")
 _GYRO_COLUMNS = {
     "dps": ("gx_dps", "gy_dps", "gz_dps"),
@@ -91,6 +92,34 @@ def read_timestamps(path: Path, *, unit: TimestampUnit = "auto") -> IntArray:
                 "Give the unit with --timestamps-unit"
             )
     return stamps
+
+
+def read_exposures_us(path: Path, *, n_frames: int) -> IntArray:
+    """Return each picture's exposure, int64 us, shape (n_frames,), one a line; as `read_timestamps` reads.
+
+    Raises
+    ------
+    VideoError
+        If a line is no time between 1 us and a second, or there is not one for each stamp.
+    """
+    lines = [(n, text.strip()) for n, text in enumerate(read_text(path, VideoError).splitlines(), start=1)]
+    rows = [(n, text) for n, text in lines if text and not text.startswith("#")]
+    if len(rows) != n_frames:
+        raise VideoError(
+            f"{path} holds {len(rows)} exposures for {n_frames} stamps; expected one a line for each picture"
+        )
+    exposures_us = np.empty(n_frames, dtype=np.int64)
+    for i, (n, text) in enumerate(rows):
+        try:
+            exposure_us = float(text)
+        except ValueError:
+            exposure_us = float("nan")
+        if not 1 <= exposure_us <= _MAX_EXPOSURE_US:
+            raise VideoError(
+                f"{path}: line {n}: {text[:40]!r}; expected an exposure time in us, from 1 to 1000000"
+            )
+        exposures_us[i] = round(exposure_us)
+    return exposures_us
 
 
 def read_imu_csv(path: Path) -> LooseImu:

@@ -82,7 +82,8 @@ class TimedCsv:
             if i and t_ns[i] <= t_ns[i - 1]:
                 raise RunFormatError(
                     f"{self.path}: line {line}: t_ns {row[column].strip()} does not come after the one "
-                    "before; rows must stand in the order of time, each once"
+                    "before; rows must stand in the order of time, each once. Leave that row out: a sample "
+                    "missing does less harm than one at a wrong time"
                 )
         return t_ns
 

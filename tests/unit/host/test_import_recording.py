@@ -71,6 +71,27 @@ def test_every_kind_of_file_gives_the_same_run(tmp_path, suffix):
     ]  # fmt: skip
 
 
+def test_exposures_that_vary_are_each_pictures_own(tmp_path):
+    times_us = [2000 + 50 * i for i in range(N)]
+    (tmp_path / "exposures.txt").write_text("# us\n" + "".join(f"{t}.0\n" for t in times_us))
+    run = imported(tmp_path, exposures=tmp_path / "exposures.txt")
+    assert run.frames.exposure_us.tolist() == times_us
+    assert run.manifest.camera.exposure_us == 2575  # the median
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("4000\n" * (N - 1), f"{N - 1} exposures for {N} stamps"),
+        ("4000\n" * (N - 1) + "-3\n", f"line {N}: '-3'"),
+    ],
+)
+def test_exposures_that_cannot_be_right_are_refused(tmp_path, text, words):
+    (tmp_path / "exposures.txt").write_text(text)
+    with pytest.raises(VideoError, match=words):
+        imported(tmp_path, exposures=tmp_path / "exposures.txt")
+
+
 def test_stamps_that_do_not_begin_at_zero_keep_their_instants(tmp_path):
     late = [s + 5 * PERIOD_US for s in stamps()]
     run = imported(tmp_path, stamps_us=late)
