@@ -7,7 +7,7 @@ One IMU rides in the brick (DESIGN 8.2); the camera stands still, or a sensor of
 import logging
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
@@ -29,7 +29,6 @@ from bricktrack_host.fusion.pose_by_pose.moving_camera import (
     CameraAlignment,
     CameraImu,
     align_both,
-    without_gains,
 )
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, smooth_poses
 from bricktrack_host.fusion.sensor_agreement import require_agreement
@@ -256,32 +255,14 @@ def prepare_run(item: FusionInput, settings: FusionSettings) -> Run:
     )  # fmt: skip
 
 
-def _with_better_clocks(item: FusionInput, run: Run, s: Smoothed, settings: FusionSettings) -> Run:
-    """Return the run of a moving camera anew: its poses in still axes are only as good as the clocks.
-
-    The delay between both sensors is found with their errors taken out. These are then found again, from the
-    samples as they came: what is believed of them before counts once.
-    """
-    if run.camera is None or s.run.camera is None:
-        return run
-    x = s.estimate.state.x[0, s.b]
-    alignment = replace(run.alignment, offset_ns=float(x[TAU] * 1e9), skew=float(x[SKEW]))
-    settled = settle_delay(
-        item.optical, without_gains(run.imu, gyro_gain=s.run.gyro_gain, acc_gain=s.run.acc_gain), alignment,
-        s.run.camera, lever_arm_mm=s.run.lever_arm_m * 1e3, settings=settings, is_near=True,
-    )  # fmt: skip
-    return Run.from_tracks(
-        item.optical, run.imu, alignment, lever_arm_mm=run.lever_arm_m * 1e3, output_t_ns=item.output_t_ns,
-        camera=replace(run.camera, delay_s=settled.delay_s),
-    )  # fmt: skip
-
-
 def smooth_one(item: FusionInput, settings: FusionSettings) -> Smoothed:
-    """Return the smoothed states of one input, pose by pose."""
+    """Return the smoothed states of one input, pose by pose.
+
+    Two sensors have twice the errors, which are found the better for the noise that a first round settles.
+    """
     run = prepare_run(item, settings)
     (smoothed,) = smooth_poses([run], settings)
     if run.camera is not None:
-        run = _with_better_clocks(item, run, smoothed, settings)
         (smoothed,) = smooth_poses([run], settings, levels=[smoothed.levels])
     return smoothed
 
