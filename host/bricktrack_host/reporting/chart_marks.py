@@ -13,6 +13,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 
 UNITS_PER_PT = 20
+_WORDS_PT = 8.5
 _NOWHERE = np.empty(0)
 
 ToPage = Callable[[FloatArray, FloatArray], IntArray]
@@ -280,7 +281,7 @@ class Arrows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Words:
-    """Words beside a place."""
+    """Words beside a place: above it, or below where the panel ends."""
 
     x: float
     y: float
@@ -297,8 +298,10 @@ class Words:
     def svg(self, to_page: ToPage, top: int, bottom: int) -> str:
         """See `Mark`."""
         u, v = to_page(np.array([self.x]), np.array([self.y]))[0].tolist()
-        u, v = u + units(self.right_pt), v - units(self.up_pt)
-        return text(u, v, self.words, colour=self.colour, bold=True)
+        above = v - units(self.up_pt)
+        is_cut = above - units(_WORDS_PT) < top
+        v = v + units(self.up_pt + _WORDS_PT) if is_cut else above
+        return text(u + units(self.right_pt), v, self.words, colour=self.colour, size_pt=_WORDS_PT, bold=True)
 
     def swatch(self, x: int, y: int, width: int) -> str:
         """See `Mark`."""

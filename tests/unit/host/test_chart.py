@@ -191,3 +191,14 @@ def test_ticks_are_round_few_inside_and_told_apart(low, high):
 def test_few_decades_have_ticks_between_them():
     assert log_ticks(0.3, 4.0, at_most=5).words == ["0.5", "1", "2"]
     assert len(log_ticks(1e-9, 1e3, at_most=5).values) <= 5
+
+
+def test_words_at_the_upper_border_stand_below_their_place():
+    def to_page(x, y):
+        return np.stack([x, y], axis=1).round().astype(int)
+
+    def line_of(y):
+        return int(re.search(r' y="(-?\d+)"', Words(500, y, "m0", "#111111").svg(to_page, 1000, 9000))[1])
+
+    assert line_of(1050) > 1050 + 100  # its letters begin below the place
+    assert line_of(5000) < 5000
