@@ -50,22 +50,8 @@ class Increments:
     f_curve_mps4: FloatArray
 
 
-def sharpened(t_s: FloatArray, values: FloatArray, filter_s: float) -> FloatArray:
-    """Return samples with the amplitudes that a low-pass took from them, at the times where it put them.
-
-    The low-pass is of second order and critically damped, ``1 / (1 + s filter_s)^2``: mean delay
-    ``2 filter_s``, -3 dB at ``0.102 / filter_s`` Hz. Without its delay its inverse is
-    ``1 - u^2 + 2/3 u^3 + O(u^5)`` with ``u = s filter_s``, whose derivatives are those of five points.
-
-    Parameters
-    ----------
-    t_s : ndarray, shape (n,)
-    values : ndarray, shape (n, 3)
-    filter_s : float, s
-        Nothing is done at zero.
-    """
-    if filter_s <= 0:
-        return values
+def _second_and_third(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of samples by five points, shape (n, 3) each."""
     step = float(np.median(np.diff(t_s)))
     at = CubicSpline(t_s, values)
     far_before, before, after, far_after = (
@@ -73,7 +59,7 @@ def sharpened(t_s: FloatArray, values: FloatArray, filter_s: float) -> FloatArra
     )
     second = (16 * (before + after) - 30 * values - far_before - far_after) / (12 * step**2)
     third = (far_after - far_before - 2 * (after - before)) / (2 * step**3)
-    return np.asarray(values - filter_s**2 * second + 2 / 3 * filter_s**3 * third)
+    return second, third
 
 
 def _spline(
@@ -155,11 +141,22 @@ class SampledVector:
         """Return its double integral."""
         return self.spline.antiderivative(2)
 
+    @cached_property
+    def _second_and_third(self) -> tuple[FloatArray, FloatArray]:
+        return _second_and_third(self.t_s, self.values)
+
     def sharpened(self, filter_s: float) -> "SampledVector":
-        """Return the vector with the amplitudes that a low-pass took from it, see `sharpened`."""
+        """Return the vector with the amplitudes that a low-pass took from it, at the times where it put them.
+
+        The low-pass is of second order and critically damped, ``1 / (1 + s filter_s)^2``: mean delay
+        ``2 filter_s``, -3 dB at ``0.102 / filter_s`` Hz. Without its delay its inverse is
+        ``1 - u^2 + 2/3 u^3 + O(u^5)`` with ``u = s filter_s``, whose derivatives are those of five points.
+        Nothing is done at zero.
+        """
         if filter_s <= 0:
             return self
-        return replace(self, values=sharpened(self.t_s, self.values, filter_s))
+        second, third = self._second_and_third
+        return replace(self, values=self.values - filter_s**2 * second + 2 / 3 * filter_s**3 * third)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,7 +187,7 @@ class ImuSignal:
     ) -> "ImuSignal":
         """Return the signals of a track; samples that are NaN, gaps or repeats are bridged.
 
-        The low-passes of the sensors are undone, but for their delays, see `sharpened`.
+        The low-passes of the sensors are undone, but for their delays, see `SampledVector.sharpened`.
 
         Raises
         ------
