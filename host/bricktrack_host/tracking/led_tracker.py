@@ -15,9 +15,9 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS
 from bricktrack_host.tracking.identity.led_identity import SegmentMethod, identify_run
 from bricktrack_host.tracking.identity.run_identities import Identities
-from bricktrack_host.tracking.identity.verification import MIN_INLIERS
 from bricktrack_host.tracking.led_model.led_profile import LedPrediction, collar_of, predict_brick
 from bricktrack_host.tracking.pictures.run_lights import find_run_lights, usual_radius_px
 from bricktrack_host.tracking.pictures.segment import Blobs, Picture

@@ -16,7 +16,9 @@ TWIST_SD = np.repeat([1.0, 300.0], 3)
 WITHOUT_THE_LAST = np.arange(7) < 6
 
 
-def evidence(off_px, *, kept=None, area=1.0, sd_px=0.06, whole=True, n_lights=7, guesses=1, dt_s=0.0):
+def evidence(
+    off_px, *, kept=None, area=1.0, sd_px=0.06, whole=True, n_lights=7, guesses=1, dt_s=0.0, tilt=None
+):
     """Of one assignment, whose lights are off from where a pose shows the LEDs."""
     given = Given(
         uv_px=SEEN.uv_px + np.asarray(off_px, dtype=float),
@@ -27,9 +29,14 @@ def evidence(off_px, *, kept=None, area=1.0, sd_px=0.06, whole=True, n_lights=7,
         twist_sd=TWIST_SD[None],
         n_lights=np.array([n_lights]),
     )
-    shown = Shown(SEEN.uv_px, SEEN.area_px2, SEEN.facing, J, SEEN.model_shift_px)
+    tilt = np.zeros(3) if tilt is None else np.asarray(tilt)
+    shown = Shown(
+        SEEN.uv_px, SEEN.area_px2, SEEN.facing, J, SEEN.model_shift_px, tilt[None], np.zeros((1, 3, 3))
+    )
     kept = np.ones((1, 7), dtype=bool) if kept is None else np.asarray(kept)[None]
-    return evidence_of(given, [shown] * guesses, kept, POSE[1][:, 2], n_pixels=N_PIXELS, min_leds=4)
+    return evidence_of(
+        given, [shown] * guesses, kept, POSE[1][:, 2], n_pixels=N_PIXELS, min_leds=4, axes_length=0.5
+    )
 
 
 def noise(sd_px, seed=1):
@@ -50,7 +57,7 @@ def test_places_at_rest_have_the_density_of_normal_lights_over_all_poses():
     profile = SEEN.model_shift_px[0].reshape(14, 1)
     own = np.repeat(0.25 * (SEEN.model_shift_px[0] ** 2).sum(axis=1), 2)
     radius2 = np.repeat(SEEN.area_px2[0] / np.pi, 2)
-    wide = np.repeat([1.0, 50.0], 3)  # rad, mm: flat, but for its known height
+    wide = np.repeat([np.sqrt(10.0), 50.0], 3)  # rad, mm: flat, but for its known height
     log_p = []
     for share, radii in ((0.8, 0.0), (0.15, 0.01), (0.05, 0.04)):
         S = (
@@ -60,13 +67,15 @@ def test_places_at_rest_have_the_density_of_normal_lights_over_all_poses():
         )
         log_p.append(np.log(share) + multivariate_normal(np.zeros(14), S).logpdf(r.ravel()))
     flat = np.logaddexp.reduce(log_p) + 3 * np.log(2 * np.pi) + np.log(wide).sum()
-    # Seven LEDs shown, none hidden, no false light; the areas as predicted; bricks wherever a camera sees them.
+    # Seven LEDs shown, none hidden, no false light; bricks wherever a camera sees them.
     m2 = np.abs(np.linalg.det(J[0, :, :, 3:5])).mean()
     z = POSE[1][0, 2]
-    n_poses = 4 * np.pi**2 * 2.6 * N_PIXELS * z / m2
-    others = (
-        7 * np.log(0.9 * 1.2 * N_PIXELS) - np.log(5040) + 7 * log_area_ratio(np.zeros(1))[0] - np.log(n_poses)
-    )
+    # Over the sphere, a weight of exp(4 (cos - 1)) of how the LEDs face: 2 pi (1 - exp(-8)) / 4; any roll.
+    n_poses = 2 * np.pi * (2 * np.pi * (1 - np.exp(-8.0)) / 4) * 2.6 * N_PIXELS * z / m2
+    # Areas as predicted, of one scatter in all LEDs; other lights' logarithms are anywhere in ln 81.
+    by_scatter = 0.95 * np.log(81.0) / (np.sqrt(2 * np.pi) * np.array([0.03, 0.1, 0.2])) + 0.05
+    areas = np.log(np.mean(by_scatter**7))
+    others = 7 * np.log(0.8 * 1.2 * N_PIXELS) - np.log(5040) + areas - np.log(n_poses)
     # Motion that shows nothing, at dt = 0, changes nothing; det(AB) of a wide Gauss: to a part in 10^4 or so.
     assert evidence(r).log_ratio[0] == pytest.approx(flat + others, abs=0.02)
 
@@ -94,7 +103,8 @@ def test_a_moving_brick_keeps_its_leds_and_a_false_light_is_not_taken_for_motion
 def test_a_light_of_another_size_is_less_like_an_led_and_a_common_factor_is_not():
     r = noise(0.06)
     area = np.ones(7)
-    np.testing.assert_allclose(evidence(r, area=1.3).log_ratio, evidence(r).log_ratio, atol=1e-9)
+    # But for what exposures leave: a quarter, one standard deviation.
+    assert evidence(r, area=np.exp(0.25)).log_ratio == pytest.approx(evidence(r).log_ratio - 0.5, abs=1e-9)
     area[3] *= 3
     assert evidence(r, area=area).log_ratio < evidence(r).log_ratio - 3
     whole = np.arange(7) != 3  # a cut light's size says nothing
@@ -121,3 +131,18 @@ def test_too_few_leds_and_no_pose_are_no_evidence():
 def test_without_a_fitted_profile_small_residuals_speak_less():
     fits = noise(0.06)
     assert evidence(fits).log_ratio > evidence(fits, guesses=2).log_ratio
+
+
+def test_a_brick_turned_away_is_less_likely_by_how_its_leds_face():
+    r, chord = noise(0.06), 2 * np.sin(0.5 * np.radians(60.0))
+    loss = evidence(r).log_ratio - evidence(r, tilt=[chord, 0.0, 0.0]).log_ratio
+    # Of eight from all facing to none facing, axes whose mean is a half have four; at 60 degrees half of that.
+    np.testing.assert_allclose(loss, 2.0, atol=1e-9)
+
+
+def test_the_area_of_one_led_tells_as_much_as_those_of_a_picture_of_one():
+    off = np.array([0.0, 0.1, 1.0])
+    own = np.mean(
+        [np.exp(-0.5 * (off / sd) ** 2) / (np.sqrt(2 * np.pi) * sd) for sd in (0.03, 0.1, 0.2)], axis=0
+    )
+    np.testing.assert_allclose(log_area_ratio(off), np.log(0.95 * own * np.log(81.0) + 0.05))

@@ -100,8 +100,8 @@ def test_the_odds_fall_with_the_distance_and_with_an_area_that_is_no_leds():
         run, _, _ = known_run(false_px=[away, 0.0])
         odds.append(log_odds(run, np.array([10]), np.array([HIDDEN]), USUAL, still=False)[0])
     assert (np.diff(odds) < 0).all()
-    # Five lights of 0.15 px in two million pixels, 2.4 for the area: log(2e6 / (2 pi 0.15^2 2)) + 1.5, about.
-    assert 12 < odds[0] < 19
+    # One free light, shown to 0.15 px in two million: log(2e6 / (2 pi 0.15^2)) = 16.5, and 3.3 for the area.
+    assert 19 < odds[0] < 20.5
     run, _, _ = known_run(false_px=[0.0, 0.0])
     run.lights.area_px2[7 * 10 + HIDDEN] *= 3
     strange = log_odds(run, np.array([10]), np.array([HIDDEN]), USUAL, still=False)[0]

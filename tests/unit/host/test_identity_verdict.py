@@ -5,6 +5,7 @@ import pytest
 from led_scenes import random_poses, seven_leds
 from pinhole import PinholeCamera
 
+from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.tracking.identity.identity_verdict import Pictures
 from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.pictures.segment import Blobs
@@ -15,6 +16,7 @@ BRICK = seven_leds(collar_mm=COLLAR)
 R, T = random_poses(1, seed=8, tilt_deg=15.0)
 SEEN, _ = predict_brick(R, T, CAMERA, BRICK, collar_mm=COLLAR)
 COLUMN = np.array([0, 3, 4, 5])
+P = BRICK.led_positions_mm
 
 
 def blobs_of(uv, area):
@@ -69,6 +71,22 @@ def test_what_lights_cannot_tell_apart_is_left_out_and_the_rest_stands():
 def test_leds_in_one_line_are_no_answer():
     found = verdict([[0, -1, -1, 3, 4, 5, 6], [0, -1, -1, 3, 4, 5, 7]], off=[(6, (0.1, 0.0))])
     assert found.blob_of_led[0, COLUMN].tolist() == COLUMN.tolist() or found.is_chance[0]
+    assert found.has_rival[0]
+
+
+def test_the_one_led_beside_a_line_stands_by_lesser_odds_than_leds_that_can_be_spared():
+    found = verdict([[0, -1, -1, 3, 4, 5, 6]])
+    assert found.blob_of_led[0].tolist() == [0, -1, -1, 3, 4, 5, 6] and not found.has_rival[0]
+
+
+def test_the_one_led_beside_a_line_is_doubted_where_another_turn_about_the_line_fits_as_well():
+    """Of m2 where it is, and a false light where m6 would be, were the brick turned about the column."""
+    middle = P[COLUMN].mean(axis=0)
+    turn = R[0] @ matrix_from_rvec(np.radians([0.0, 10.0, 0.0]))
+    turned, _ = predict_brick(turn[None], T + (R[0] - turn) @ middle, CAMERA, BRICK, collar_mm=COLLAR)
+    off = turned.uv_px[0, 6] - SEEN.uv_px[0, 6]
+    assert np.linalg.norm(off) > 10  # px: of m6 as it is there is no light
+    found = verdict([[0, -1, 2, 3, 4, 5, -1], [0, -1, -1, 3, 4, 5, 7]], off=[(6, off)])
     assert found.has_rival[0]
 
 

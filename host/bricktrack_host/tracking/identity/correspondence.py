@@ -13,12 +13,12 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
+from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS
 from bricktrack_host.tracking.identity.identity_candidates import N_KEPT, Candidates, Pattern
 from bricktrack_host.tracking.identity.identity_search import Lights, propose
 from bricktrack_host.tracking.identity.identity_verdict import Pictures
 from bricktrack_host.tracking.identity.verification import (
     MIN_FACING,
-    MIN_INLIERS,
     Correspondence,
     identity_gate_px,
     no_correspondence,

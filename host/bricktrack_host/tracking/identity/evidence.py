@@ -28,15 +28,21 @@ _MISPLACED_SHARE = {True: (0.8, 0.15, 0.05), False: (0.5, 0.3, 0.2)}
 _SPEEDS = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0])
 """Shares of what is not known of the motion that the brick may move at: at rest, or at any speed alike."""
 _AT_REST = 0.5
-_AREA_SD = 0.2  # of the logarithm of an LED's area over the predicted one: glare, limb darkening, the profile
-_AREA_OTHER = 0.1  # share of LEDs whose area says nothing: partly covered, run together with another light
+_AREA_SDS = np.array([0.03, 0.1, 0.2])
+"""Of the logarithm of an LED's area over the predicted one, in one picture, alike likely: clean ones leave
+0.01, glare, limb darkening and the profile more."""
+_AREA_OTHER = 0.05  # share of LEDs whose area says nothing: partly covered, run together with another light
 _LOG_AREAS = np.log(81.0)  # of other lights: what segmentation lets pass is a third to three times the radius
 _SCATTERED = 2.0  # chi-square of so many times its freedom: one in ten at four, one in fifteen at six
+_COMMON_AREA_SD = 0.25  # of the logarithm of the factor that all areas share
 _COMMON_AREA = 0.5  # limit of the logarithm of the factor that all areas share
-_HIDDEN = 0.1  # share of LEDs facing the camera that show no light
+_HIDDEN = 0.2  # share of LEDs facing the camera that show no light
 _FALSE = 5.0  # false lights to be expected in a picture, the more the less likely
-_LOG_TURNS = float(np.log(4 * np.pi**2))  # of all attitudes that show the camera one side of a brick
-_PRIOR = np.diag([1.0, 1.0, 1.0, 4e-4, 4e-4, 4e-4, 1.0])
+_TURNED_TO_CAMERA = 8.0
+"""By how much likelier, as a logarithm, all LEDs facing the camera are than none: layouts are made for it.
+With axes 45 degrees about their mean, half of all pictures show a brick within 30 degrees of facing the
+camera, nineteen in twenty within 60."""
+_PRIOR = np.diag([0.1, 0.1, 0.1, 4e-4, 4e-4, 4e-4, 1.0])
 """Inverse variances of turn, rad, and shift, mm, about the fitted pose, both wide, and of the profile."""
 _DEPTHS = 2.6  # integral of (z / z0)^2 from half the distance to twice that: where bricks may be
 
@@ -108,6 +114,10 @@ class Shown:
         By ``[dtheta rad, dt mm]``.
     profile_px : ndarray, shape (n, n_leds, 2), px
         One standard deviation of what this guess leaves unknown in all LEDs alike.
+    tilt : ndarray, shape (n, 3)
+        Of the LEDs' mean axis from the line of sight; zero where it faces the camera.
+    J_tilt_per_turn : ndarray, shape (n, 3, 3)
+        By dtheta, rad.
     """
 
     uv_px: FloatArray
@@ -115,6 +125,8 @@ class Shown:
     facing: FloatArray
     J_px_per_pose: FloatArray
     profile_px: FloatArray
+    tilt: FloatArray
+    J_tilt_per_turn: FloatArray
 
 
 def evidence_of(
@@ -125,6 +137,7 @@ def evidence_of(
     *,
     n_pixels: int,
     min_leds: int,
+    axes_length: float,
 ) -> Evidence:
     """Return what speaks for n assignments of lights to LEDs.
 
@@ -141,12 +154,15 @@ def evidence_of(
         Of the picture.
     min_leds : int
         Assignments of fewer LEDs, or without a pose, have minus infinity.
+    axes_length : float
+        Length of the mean of the LEDs' axes: 1 where all are one, 0 where they point all around.
 
     Notes
     -----
-    Of a brick: each LED that faces the camera shows a light but for one in ten, poses are alike likely
-    wherever the camera sees a brick. Of false lights: each anywhere, their number by Poisson's law. By
-    Markov's inequality false lights alone reach odds of x to one in one picture out of x at most.
+    Of a brick: each LED that faces the camera shows a light but for one in five; poses are alike likely
+    wherever the camera sees a brick, at any roll, the likelier the better the LEDs face it. Of false lights:
+    each anywhere, their number by Poisson's law. By Markov's inequality false lights alone reach odds of x to
+    one in one picture out of x at most.
     """
     n = len(kept)
     n_leds = kept.sum(axis=1)
@@ -158,8 +174,9 @@ def evidence_of(
         return Evidence(log_ratio, is_scattered)
     given, kept, n_leds = rows_of(given, rows), kept[rows], n_leds[rows]
     guesses = [rows_of(shown, rows) for shown in guesses]
+    turned = _TURNED_TO_CAMERA * axes_length
     by_guess, chi2 = zip(
-        *(_of_lights(given, shown, kept, len(guesses) == 1) for shown in guesses), strict=True
+        *(_of_lights(given, shown, kept, len(guesses) == 1, turned) for shown in guesses), strict=True
     )
     lights = np.logaddexp.reduce(by_guess, axis=0) - np.log(len(guesses))
     is_scattered[rows] = np.min(chi2, axis=0) > _SCATTERED * np.maximum(2 * n_leds - 6, 1)
@@ -172,12 +189,24 @@ def evidence_of(
     hidden = n_leds * np.log(1 - _HIDDEN) + n_hidden * np.log(_HIDDEN)
     J = np.where(kept[..., None, None], guesses[0].J_px_per_pose[..., 3:5], 0.0)
     mm2_per_px2 = n_leds / np.abs(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]).sum(axis=1)
-    log_poses = _LOG_TURNS + np.log(_DEPTHS * n_pixels * mm2_per_px2 * np.maximum(depth_mm[rows], 1.0))
+    log_poses = np.log(_DEPTHS * n_pixels * mm2_per_px2 * np.maximum(depth_mm[rows], 1.0))
+    log_poses += _log_turns(turned)
     log_ratio[rows] = lights + elsewhere + hidden - log_poses
     return Evidence(log_ratio, is_scattered)
 
 
-def _of_lights(given: Given, shown: Shown, kept: BoolArray, is_fitted: bool) -> tuple[FloatArray, FloatArray]:
+def _log_turns(turned: float) -> float:
+    """Return the logarithm of the integral over all attitudes of von Mises' and Fisher's law, one at most.
+
+    Of the LEDs' mean axis about the line of sight, at any roll.
+    """
+    k = max(turned, 1e-6)
+    return float(np.log(4 * np.pi**2 * -np.expm1(-2 * k) / k))
+
+
+def _of_lights(
+    given: Given, shown: Shown, kept: BoolArray, is_fitted: bool, turned: float
+) -> tuple[FloatArray, FloatArray]:
     """Return the logarithm of the density of lights, the pose's taken as one, and the chi-square at rest."""
     radius2 = np.where(kept, shown.area_px2 / np.pi, 1.0)
     own2 = OWN_SHARE**2 * (shown.profile_px**2).sum(axis=-1) if is_fitted else 0.0
@@ -189,20 +218,26 @@ def _of_lights(given: Given, shown: Shown, kept: BoolArray, is_fitted: bool) -> 
     per_twist = np.where(kept, given.dt_s, 0.0)[..., None, None] * given.twist_sd[:, None, None]
     X = np.concatenate([X[..., :7], X[..., :6] * per_twist, X[..., 7:]], axis=-1)
     cov = np.where(kept[..., None, None], given.cov_px2, np.eye(2))
+    J_tilt, tilt = shown.J_tilt_per_turn, shown.tilt
+    X_tilt = np.zeros((len(kept), 3, X.shape[-1]))
+    X_tilt[..., :3], X_tilt[..., -1] = J_tilt, tilt
+    by_tilt = turned * np.swapaxes(X_tilt, -1, -2) @ X_tilt
     log_density, chi2 = [], []
     for share, radii in zip(_MISPLACED_SHARE[is_fitted], _MISPLACED_RADII[is_fitted], strict=True):
         by_speed, at_rest = _by_speed(
-            X, cov + (extra + radii**2 * radius2)[..., None, None] * np.eye(2), kept
+            X, cov + (extra + radii**2 * radius2)[..., None, None] * np.eye(2), kept, by_tilt
         )
         log_density.append(np.log(share) + by_speed)
-        chi2.append(at_rest)
+        chi2.append(at_rest - turned * (tilt**2).sum(axis=-1))
     shares = np.full(len(_SPEEDS), (1 - _AT_REST) / (len(_SPEEDS) - 1))
     shares[0] = _AT_REST
     places = np.logaddexp.reduce(np.logaddexp.reduce(log_density, axis=0) + np.log(shares), axis=1)
     return places + _of_areas(given.area_px2, shown.area_px2, kept & given.is_whole), chi2[0]
 
 
-def _by_speed(X: FloatArray, S: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _by_speed(
+    X: FloatArray, S: FloatArray, kept: BoolArray, by_tilt: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return logarithms of densities, (n, speeds), and the chi-square at rest, (n,).
 
     Parameters
@@ -221,7 +256,7 @@ def _by_speed(X: FloatArray, S: FloatArray, kept: BoolArray) -> tuple[FloatArray
     n, n_leds = kept.shape
     flat = X.reshape(n, 2 * n_leds, X.shape[-1])
     weighted = (W @ X).reshape(flat.shape)
-    M = np.swapaxes(flat, -1, -2) @ weighted
+    M = np.swapaxes(flat, -1, -2) @ weighted + by_tilt
     A = M[:, :7, :7] + _PRIOR
     back = np.linalg.solve(A, M[:, :7, 7:])
     left = M[:, 7:, 7:] - M[:, 7:, :7] @ back  # what pose and profile do not explain
@@ -248,8 +283,15 @@ def _of_areas(area_px2: FloatArray, predicted_px2: FloatArray, kept: BoolArray) 
     rows = np.arange(len(ratio))
     common = 0.5 * (ordered[rows, (n - 1) // 2] + ordered[rows, n // 2])
     common = np.clip(np.where(known.any(axis=1), common, 0.0), -_COMMON_AREA, _COMMON_AREA)
-    gain = log_area_ratio(ratio - common[:, None])
-    return np.asarray(np.where(known, gain, 0.0).sum(axis=1))
+    gain = np.where(known[..., None], _of_area(ratio - common[:, None]), 0.0).sum(axis=1)
+    gain = np.logaddexp.reduce(gain, axis=1) - np.log(len(_AREA_SDS))
+    return np.asarray(gain - 0.5 * (common / _COMMON_AREA_SD) ** 2)
+
+
+def _of_area(log_ratio: FloatArray) -> FloatArray:
+    """Return what an LED's area says by each scatter of areas, (..., scatters)."""
+    own = np.exp(-0.5 * (log_ratio[..., None] / _AREA_SDS) ** 2) / (np.sqrt(2 * np.pi) * _AREA_SDS)
+    return np.asarray(np.log((1 - _AREA_OTHER) * own * _LOG_AREAS + _AREA_OTHER))
 
 
 def log_area_ratio(log_ratio: FloatArray) -> FloatArray:
@@ -260,5 +302,4 @@ def log_area_ratio(log_ratio: FloatArray) -> FloatArray:
     log_ratio : ndarray
         Logarithm of the area over the predicted one, less what all LEDs of the picture have in common.
     """
-    own = (1 - _AREA_OTHER) * np.exp(-0.5 * (log_ratio / _AREA_SD) ** 2) / (np.sqrt(2 * np.pi) * _AREA_SD)
-    return np.asarray(np.log((own + _AREA_OTHER / _LOG_AREAS) * _LOG_AREAS))
+    return np.asarray(np.logaddexp.reduce(_of_area(log_ratio), axis=-1) - np.log(len(_AREA_SDS)))

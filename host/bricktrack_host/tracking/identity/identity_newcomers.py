@@ -9,10 +9,11 @@ neighbouring frames, and how the run moves within the frame.
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS
 from bricktrack_host.tracking.identity.evidence import log_area_ratio
 from bricktrack_host.tracking.identity.identity_prediction import shown_by_the_rest
 from bricktrack_host.tracking.identity.run_identities import RunIdentities
-from bricktrack_host.tracking.identity.verification import MIN_INLIERS, motion_of
+from bricktrack_host.tracking.identity.verification import motion_of
 
 _SURE = 5.0  # log odds that an LED be believed: 150 to one
 _FLEETING = 10.0  # more for one that neither the frame before nor the one after shows

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, median_filter
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS, LedLights
 from bricktrack_host.tracking.identity.identity_motion import (
     RunMotion,
     places_px,
@@ -25,7 +26,7 @@ from bricktrack_host.tracking.identity.run_identities import (
     is_whole,
     scatter_px,
 )
-from bricktrack_host.tracking.identity.verification import MIN_INLIERS, LedLights, Verified, motion_of
+from bricktrack_host.tracking.identity.verification import Verified, motion_of
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.refine import LedMotion
 

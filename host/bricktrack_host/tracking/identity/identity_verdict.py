@@ -1,7 +1,7 @@
 """What is beyond doubt in pictures for which assignments of lights to LEDs are proposed.
 
-The proposals are verified, and the likeliest is the answer, in those LEDs in which all agree that are nearly
-as likely. Among them are the likeliest one without each of its LEDs: by these the LED's own light has odds.
+The proposals are verified, and weighed with the likeliest ones without each of their LEDs. The likeliest is
+the answer, in those LEDs whose lights have the odds of all that agree against all that do not.
 """
 
 from collections.abc import Sequence
@@ -12,22 +12,16 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
+from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS, RunLights
 from bricktrack_host.tracking.identity.identity_motion import unknown_motion
-from bricktrack_host.tracking.identity.verification import (
-    MIN_INLIERS,
-    RunLights,
-    Verified,
-    in_line,
-    verify,
-)
+from bricktrack_host.tracking.identity.verification import Verified, in_line, verify
+from bricktrack_host.tracking.identity.weighing import weighed_at
 from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracking.pose.refine import LedMotion, RefinedPoses
 
-_RIVAL = 4.6  # log odds, 100 to one, of an answer against one with other lights
-_LED = 7.0  # 1000 to one, of an LED's light against its being false
-_BESIDE_LINE = 4.0
-"""50 to one, of the only LED beside others in one line, which tell so little of where it is that of right
-ones too one in some hundred has less than 1000 to one."""
+_SURE = 7.0  # log odds, 1000 to one, of each LED's light against all else that was weighed
+_ENOUGH = 4.0  # 50 to one, of LEDs without which there is no answer
+_CONTENDS = 12.0  # log odds below the best at which an assignment without each of its LEDs may still matter
 _BRICK = 7.0  # log odds of any brick at all: false lights alone reach it in one picture of 1000, at most
 
 
@@ -101,28 +95,58 @@ class Pictures:
         row = np.full(self._lights.count.size, -1)
         row[of[best]] = best
         poses, evidence = verified.poses, verified.log_evidence
-        at, without = _each_left_out(kept, best)
-        less = self._verified(of[at], without, _starts(poses, at), intruders=False)
+        # An LED that was left out as an intruder may be right, and another the false one.
+        reduced = (kept != assigned).any(axis=1) & (evidence > evidence[row[of]] - _CONTENDS) & (row[of] >= 0)
+        at, without = _each_left_out(
+            np.concatenate([kept[best], assigned[reduced]]),
+            np.concatenate([best, np.flatnonzero(reduced)]),
+        )
         answer = np.where(row[:, None] >= 0, kept[row], -1)
-        others = np.concatenate([kept, np.where(less.kept, without, -1)])
-        is_doubtful = _doubtful(
+        log_odds = _log_odds(
             answer,
-            evidence[row],
             np.concatenate([of, of[at]]),
-            others,
-            np.concatenate([evidence, less.log_evidence]),
-            is_in_line=in_line(others >= 0, self._brick),
+            np.concatenate([kept, without]),
+            np.concatenate([evidence, self._weighed(of[at], without, poses.take(at))]),
         )
         n_leds = (answer >= 0).sum(axis=1)
-        answer[is_doubtful] = -1
-        has_rival = ((answer >= 0).sum(axis=1) < MIN_INLIERS) | in_line(answer >= 0, self._brick)
+        whole = answer
+        answer = np.where(log_odds > _SURE, whole, -1)
+        few = ~self._is_enough(answer)
+        answer[few] = np.where(log_odds > _ENOUGH, whole, -1)[few]
+        has_rival = ~self._is_enough(answer)
         is_chance = evidence[row] < _BRICK
-        again = np.flatnonzero(is_doubtful.any(axis=1) & (row >= 0) & ~has_rival & ~is_chance)
+        again = np.flatnonzero((answer != whole).any(axis=1) & (row >= 0) & ~has_rival & ~is_chance)
         if again.size:
             fitted = self._verified(again, answer[again], _starts(poses, row[again]), intruders=False)
             poses = poses.replaced(row[again], fitted.poses)
             has_rival[again] = (fitted.kept != (answer[again] >= 0)).any(axis=1)
         return Verdict(row, answer, poses, n_leds, is_chance, has_rival)
+
+    def _is_enough(self, assigned: IntArray) -> BoolArray:
+        """Tell which assignments have a pose, with an LED to spare."""
+        given = assigned >= 0
+        return np.asarray((given.sum(axis=1) >= MIN_INLIERS) & ~in_line(given, self._brick))
+
+    def _weighed(self, of: IntArray, assigned: IntArray, poses: RefinedPoses) -> FloatArray:
+        """Return what speaks for assignments of an LED less than the given poses were fitted to."""
+        out = np.full(of.size, -np.inf)
+        line = in_line(assigned >= 0, self._brick)
+        rows = np.flatnonzero(line)  # they have no pose of their own, but all those about the line
+        if rows.size:
+            out[rows] = weighed_at(
+                self._lights.of_leds(of[rows], assigned[rows]),
+                poses.take(rows),
+                self._rays,
+                self._brick,
+                collar_mm=self._collar_mm,
+                motion=None,
+                n_lights=self._lights.count[of[rows]],
+            ).log_ratio
+        rows = np.flatnonzero(~line)
+        less = self._verified(of[rows], assigned[rows], _starts(poses, rows), intruders=False)
+        is_whole = (less.kept == (assigned[rows] >= 0)).all(axis=1)
+        out[rows] = np.where(is_whole, less.log_evidence, -np.inf)
+        return out
 
     def _verified(
         self,
@@ -167,34 +191,38 @@ def _likeliest(of: IntArray, log_evidence: FloatArray) -> IntArray:
     return np.asarray(order[np.unique(of[order], return_index=True)[1]])
 
 
-def _each_left_out(kept: IntArray, rows: IntArray) -> tuple[IntArray, IntArray]:
+def _each_left_out(assigned: IntArray, rows: IntArray) -> tuple[IntArray, IntArray]:
     """Return the rows, repeated, and their assignments without one LED each that leave enough."""
-    at, led = np.nonzero(kept[rows] >= 0)
-    at = rows[at]
-    without = kept[at]
+    at, led = np.nonzero(assigned >= 0)
+    without = assigned[at]
     without[np.arange(at.size), led] = -1
     enough = (without >= 0).sum(axis=1) >= MIN_INLIERS
-    return at[enough], without[enough]
+    return rows[at[enough]], without[enough]
 
 
 def _starts(poses: RefinedPoses, rows: IntArray) -> tuple[FloatArray, FloatArray]:
     return poses.R_camera_brick[rows], poses.t_camera_brick_mm[rows]
 
 
-def _doubtful(
-    answer: IntArray,
-    log_evidence: FloatArray,
-    of: IntArray,
-    others: IntArray,
-    others_evidence: FloatArray,
-    *,
-    is_in_line: BoolArray,
-) -> BoolArray:
-    """Return which LEDs of answers (n, n_leds) other assignments ``of`` the same pictures leave in doubt."""
-    own = answer[of]
-    has_other_lights = ((others >= 0) & (others != own)).any(axis=1)
-    margin = np.where(has_other_lights, _RIVAL, np.where(is_in_line, _BESIDE_LINE, _LED))
-    near = (own >= 0).any(axis=1) & (others_evidence > log_evidence[of] - margin)
-    out = np.zeros(answer.shape, dtype=bool)
-    np.logical_or.at(out, of, near[:, None] & (own >= 0) & (others != own))
-    return out
+def _log_odds(answer: IntArray, of: IntArray, assigned: IntArray, log_evidence: FloatArray) -> FloatArray:
+    """Return the odds of the lights that answers (n, n_leds) give to LEDs, by all that was weighed.
+
+    Parameters
+    ----------
+    of, assigned, log_evidence : ndarray, shapes (m,), (m, n_leds) and (m,)
+        Pictures, assignments and what speaks for them; some may come more than once.
+    """
+    order = np.lexsort((-log_evidence, *assigned.T, of))
+    order = order[np.isfinite(log_evidence[order])]
+    key = np.column_stack([of, assigned])[order]
+    order = order[np.append(True, (np.diff(key, axis=0) != 0).any(axis=1))[: order.size]]
+    out = np.full(answer.shape, -np.inf)
+    if order.size == 0:
+        return out
+    picture, first = np.unique(of[order], return_index=True)
+    agrees = assigned[order] == answer[of[order]]
+    weight = log_evidence[order, None]
+    with_it = np.logaddexp.reduceat(np.where(agrees, weight, -np.inf), first, axis=0)
+    without = np.logaddexp.reduceat(np.where(agrees, -np.inf, weight), first, axis=0)
+    out[picture] = with_it - np.logaddexp(without, 0.0)  # or no brick at all
+    return np.where(answer >= 0, out, -np.inf)

@@ -15,6 +15,7 @@ from scipy.ndimage import median_filter
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
+from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS, LedLights
 from bricktrack_host.tracking.identity.correspondence import search_correspondence
 from bricktrack_host.tracking.identity.identity_motion import unknown_motion
 from bricktrack_host.tracking.identity.identity_settling import settle
@@ -28,7 +29,7 @@ from bricktrack_host.tracking.identity.run_identities import (
     is_whole,
     rms_px,
 )
-from bricktrack_host.tracking.identity.verification import MIN_INLIERS, Correspondence, LedLights, Verified
+from bricktrack_host.tracking.identity.verification import Correspondence, Verified
 from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.prsoi import ROUGH_MM, prsoi_starts

@@ -7,9 +7,9 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
+from bricktrack_host.tracking.identity.assigned_lights import RunLights
 from bricktrack_host.tracking.identity.verification import (
     Correspondence,
-    RunLights,
     no_correspondence,
     verified_correspondence,
     verify,

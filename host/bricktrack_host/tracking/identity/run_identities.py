@@ -8,20 +8,14 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
+from bricktrack_host.tracking.identity.assigned_lights import LedLights, RunLights
 from bricktrack_host.tracking.identity.identity_motion import (
     RunMotion,
     poses_between,
     run_motion,
     turn_between,
 )
-from bricktrack_host.tracking.identity.verification import (
-    LedLights,
-    RunLights,
-    Verified,
-    identity_gate_px,
-    in_line,
-    verify,
-)
+from bricktrack_host.tracking.identity.verification import Verified, identity_gate_px, in_line, verify
 from bricktrack_host.tracking.led_model.led_profile import LedPrediction, predict_brick
 from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracking.pose.finite import all_finite

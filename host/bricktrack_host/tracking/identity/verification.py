@@ -4,33 +4,24 @@
 equally well, that is the answer; none is chosen.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of, with_rows
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
-from bricktrack_common.rotations import matrix_from_rvec
-from bricktrack_host.tracking.identity.evidence import Evidence, Given, Shown, evidence_of
-from bricktrack_host.tracking.identity.identity_motion import unknown_motion
-from bricktrack_host.tracking.led_model.led_profile import predict_brick, shift_per_radius
-from bricktrack_host.tracking.pictures.segment import Blobs
+from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS, LedLights
+from bricktrack_host.tracking.identity.evidence import Evidence
+from bricktrack_host.tracking.identity.weighing import weighed_at
 from bricktrack_host.tracking.pose.finite import all_finite
-from bricktrack_host.tracking.pose.frame_motion import UNKNOWN_TWIST_SD
 from bricktrack_host.tracking.pose.prsoi import ROUGH_MM, prsoi_starts
 from bricktrack_host.tracking.pose.refine import LedMotion, RefinedPoses, refine_poses
 
-MIN_INLIERS = 4
 MIN_FACING = 0.05
 """Cosine between an LED's axis and the line of sight below which it is not believed to be seen."""
 _MAX_BAD, _MAX_INTRUDERS = 3, 2
-_COLLARS, _BETWEEN_COLLARS = (0.0, 0.2, 0.4, 0.6), 0.05
-"""Guesses of a collar that was not fitted, in LED radii, and what each leaves, about: the shift of the
-centroid to the next guess, in radii times the sine of the view angle."""
 _SLIM = 1e-3  # ratio of the singular values of the positions of LEDs in one line
-_ANY_MM = np.array([0.0, 0.0, 130.0])  # in place of what is not known
 _HOPELESS = 25.0  # log likelihood below the best of the picture: an intruder left out does not make up for it
 _CUT_SD_GATES = 0.9
 """Trust in a cut light, over the gate: what is left has its centroid elsewhere, up to a radius."""
@@ -93,81 +84,6 @@ def verified_correspondence(blob_of_led: IntArray, poses: RefinedPoses, i: int) 
         is_ambiguous=False,
         reason="",
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LedLights:
-    """The lights that assignments give to LEDs; NaN for none.
-
-    Attributes
-    ----------
-    uv_px : ndarray, shape (n, n_leds, 2), px
-    cov_px2 : ndarray, shape (n, n_leds, 2, 2), px^2
-    area_px2 : ndarray, shape (n, n_leds), px^2
-    is_whole : ndarray of bool, shape (n, n_leds)
-        False where the border or a card cuts a light, or it is two.
-    """
-
-    uv_px: FloatArray
-    cov_px2: FloatArray
-    area_px2: FloatArray
-    is_whole: BoolArray
-
-    def take(self, rows: IntArray) -> "LedLights":
-        """Return some of the assignments."""
-        return rows_of(self, rows)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunLights:
-    """The lights of many pictures, one after the other.
-
-    Attributes
-    ----------
-    first : ndarray of int64, shape (n_pictures + 1,)
-        Where each picture's begin.
-    uv_px, cov_px2, area_px2, flags : ndarray, shapes (n, 2), (n, 2, 2), (n,) and (n,)
-        See `segment.Blobs`.
-    """
-
-    first: IntArray
-    uv_px: FloatArray
-    cov_px2: FloatArray
-    area_px2: FloatArray
-    flags: IntArray
-
-    @staticmethod
-    def of(pictures: Sequence[Blobs | None]) -> "RunLights":
-        """Put the lights of pictures together; `None` has none."""
-        given = [b for b in pictures if b is not None]
-        count = [0 if b is None else len(b) for b in pictures]
-        return RunLights(
-            first=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
-            uv_px=np.concatenate([np.empty((0, 2)), *(b.uv_px for b in given)]),
-            cov_px2=np.concatenate([np.empty((0, 2, 2)), *(b.cov_px2 for b in given)]),
-            area_px2=np.concatenate([np.empty(0), *(b.area_px2 for b in given)]),
-            flags=np.concatenate([np.empty(0, dtype=np.int64), *(b.flags for b in given)]),
-        )
-
-    @property
-    def count(self) -> IntArray:
-        """Number of lights of each picture."""
-        return np.diff(self.first)
-
-    def of_leds(self, pictures: IntArray, blob_of_led: IntArray) -> LedLights:
-        """Take the lights of assignments (n, n_leds), numbered within each one's picture; -1 for none."""
-        given = blob_of_led >= 0
-        index = np.where(given, self.first[pictures][:, None] + blob_of_led, 0)
-        uv, cov, area = (self._taken(x, index, given) for x in (self.uv_px, self.cov_px2, self.area_px2))
-        return LedLights(
-            uv, cov, area, given & (self._taken(self.flags.astype(np.float64), index, given) == 0)
-        )
-
-    @staticmethod
-    def _taken(values: FloatArray, index: IntArray, given: BoolArray) -> FloatArray:
-        out = np.full((*index.shape, *values.shape[1:]), np.nan)
-        out[given] = values[index[given]]
-        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,7 +164,6 @@ def verify(
     gate = np.broadcast_to(gate[:, None] if gate.ndim == 1 else gate, uv.shape[:2])
     picture = np.arange(n) if picture is None else picture
     n_lights = np.full(n, brick_model.n_leds) if n_lights is None else n_lights
-    mode = ray_model.sensor_mode
     variance = np.where(lights.is_whole, _IDENTITY_SD_PX**2, (_CUT_SD_GATES * gate) ** 2)
     cov = variance[..., None, None] * np.eye(2)
 
@@ -267,14 +182,9 @@ def verify(
 
     def weigh(rows: IntArray, uv: FloatArray, poses: RefinedPoses) -> Evidence:
         within = None if motion is None else motion_of(motion, rows)
-        given = _given(lights.take(rows), uv, within, n_lights[rows], ray_model)
-        return evidence_of(
-            given,
-            _guesses(poses, within, ray_model, brick_model, collar_mm),
-            all_finite(uv),
-            poses.t_camera_brick_mm[:, 2],
-            n_pixels=mode.width * mode.height,
-            min_leds=MIN_INLIERS,
+        some = replace(lights.take(rows), uv_px=uv)
+        return weighed_at(
+            some, poses, ray_model, brick_model, collar_mm=collar_mm, motion=within, n_lights=n_lights[rows]
         )
 
     def start(rows: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -327,50 +237,6 @@ def verify(
     return Verified(
         kept, poses, np.where(kept.any(axis=1), evidence.log_ratio, -np.inf), evidence.is_scattered
     )
-
-
-def _given(
-    lights: LedLights, uv_px: FloatArray, motion: LedMotion | None, n_lights: IntArray, ray_model: RayModel
-) -> Given:
-    within = unknown_motion(uv_px, ray_model) if motion is None else motion
-    return Given(
-        uv_px=uv_px,
-        cov_px2=lights.cov_px2,
-        area_px2=lights.area_px2,
-        is_whole=lights.is_whole,
-        dt_s=within.dt_s,
-        twist_sd=np.tile(UNKNOWN_TWIST_SD, (len(uv_px), 1)) if within.twist_sd is None else within.twist_sd,
-        n_lights=n_lights,
-    )
-
-
-def _guesses(
-    poses: RefinedPoses,
-    motion: LedMotion | None,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    collar_mm: float | None,
-) -> list[Shown]:
-    """Return what poses show by each guess of the profile: one where it was fitted."""
-    R, t_mm = poses.R_camera_brick[:, None], poses.t_camera_brick_mm[:, None]
-    if motion is not None:
-        R, t_mm = R @ matrix_from_rvec(motion.rvec_brick_rad), t_mm + motion.shift_camera_mm
-    posed = all_finite(R, 3) & all_finite(t_mm, 2)
-    R, t_mm = (
-        np.where(posed[:, None, None, None], R, np.eye(3)),
-        np.where(posed[:, None, None], t_mm, _ANY_MM),
-    )
-    wider, collars_mm = 1.0, [collar_mm or 0.0]
-    if collar_mm is None:
-        radius_mm = float(np.median(brick_model.led_radii_mm))
-        wider = _BETWEEN_COLLARS / shift_per_radius(0.0, brick_model)
-        collars_mm = [share * radius_mm for share in _COLLARS]
-    out = []
-    for guess_mm in collars_mm:
-        seen, J = predict_brick(R, t_mm, ray_model, brick_model, collar_mm=guess_mm)
-        places = np.where(posed[:, None, None], seen.uv_px, np.nan)
-        out.append(Shown(places, seen.area_px2, seen.facing, J, wider * seen.model_shift_px))
-    return out
 
 
 def motion_of(motion: LedMotion, rows: IntArray) -> LedMotion:
