@@ -34,7 +34,9 @@ from bricktrack_host.tracking.pose.frame_motion import led_motion
 CHOICES = {
     "noise chosen": FusionSettings(),
     "noise as stated": FusionSettings(adapt_noise=False),
-    "sensors exact": FusionSettings(adapt_noise=False, sensor_gain_sd=0.0, lever_arm_sd_mm=0.0),
+    "sensors exact": FusionSettings(
+        adapt_noise=False, vibration_beside_camera=False, sensor_gain_sd=0.0, lever_arm_sd_mm=0.0
+    ),
 }
 
 

@@ -242,6 +242,7 @@ def prepare_run(item: FusionInput, settings: FusionSettings) -> Run:
     run = Run.from_tracks(
         item.optical, imu, alignment,
         lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns, camera=motion,
+        vibration_beside_camera=settings.vibration_beside_camera,
     )  # fmt: skip
     if motion is None:
         return run

@@ -38,6 +38,8 @@ class FusionSettings:
     adapt_noise : bool
         Whether each run chooses its shares of roughness and its multiples of the systematic errors by the
         likelihood of its frames.
+    vibration_beside_camera : bool
+        Whether the slow accelerations that a vibration leaves in the samples are sought beside the camera's.
     gyro_bias_walk_radps, acc_bias_walk_mps2 : float
         Wander of the biases in one second.
     gyro_bias_sd_radps, acc_bias_sd_mps2 : float
@@ -80,6 +82,7 @@ class FusionSettings:
     acc_impact_share: float = 1.0
     impact_arm_mm: float = 100.0
     adapt_noise: bool = True
+    vibration_beside_camera: bool = True
     gyro_bias_walk_radps: float = 3e-4
     acc_bias_walk_mps2: float = 0.01
     gyro_bias_sd_radps: float = 0.02

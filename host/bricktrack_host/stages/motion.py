@@ -29,9 +29,11 @@ from bricktrack_host.tracking.pose.refine import LedMotion
 from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1
-# How far samples are to be believed, and how far their scales are off, decides about dropouts and impacts.
-# Within a frame's 20 ms it changes nothing that can be seen (`scripts/bench_retime.py`).
-_WITHIN_FRAMES = FusionSettings(adapt_noise=False, sensor_gain_sd=0.0, lever_arm_sd_mm=0.0)
+# How far samples are to be believed, how far scales are off, and what a vibration leaves in samples decides
+# about dropouts and impacts. Within a frame's 20 ms it cannot be seen (`scripts/bench_retime.py`).
+_WITHIN_FRAMES = FusionSettings(
+    adapt_noise=False, vibration_beside_camera=False, sensor_gain_sd=0.0, lever_arm_sd_mm=0.0
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

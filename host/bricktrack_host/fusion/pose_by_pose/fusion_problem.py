@@ -90,10 +90,14 @@ class Run:
         lever_arm_mm: FloatArray,
         output_t_ns: IntArray,
         camera: CameraMotion | None = None,
+        vibration_beside_camera: bool = True,
     ) -> "Run":
         """Return what of a run is used: frames with a pose, and the time to be covered."""
         if camera is None:
-            samples = samples_beside_camera(optical, imu, alignment, lever_arm_mm * 1e-3)
+            if vibration_beside_camera:
+                samples = samples_beside_camera(optical, imu, alignment, lever_arm_mm * 1e-3)
+            else:
+                samples = clean_samples(imu)
             samples = replace(samples, fill=fill_of_gaps(optical, samples, alignment, lever_arm_mm * 1e-3))
         else:
             samples = clean_samples(imu)
