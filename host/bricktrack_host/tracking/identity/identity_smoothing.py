@@ -43,7 +43,9 @@ def steady_poses(run: RunIdentities, usual_px: FloatArray) -> tuple[FloatArray, 
         frames = np.arange(known[0], known[-1] + 1) if known.size >= _LEAST_FRAMES else known
         R[frames], t_mm[frames] = _bridged(run, known, frames)
         parts += [frames] if known.size >= _LEAST_FRAMES else []
-    lights = run.lights_of(np.arange(len(R)))
+    if not parts:
+        return R, t_mm
+    lights, frames = run.lights_of(np.arange(len(R))), np.concatenate(parts)
     for motion_is_known in (False, True):
         if motion_is_known:
             within = run_motion(
@@ -51,10 +53,9 @@ def steady_poses(run: RunIdentities, usual_px: FloatArray) -> tuple[FloatArray, 
             ).within
         else:
             within = unknown_motion(lights.uv_px, run.ray_model)
-        for frames in parts:
-            R[frames], t_mm[frames] = _smoothed(
-                run, frames, R[frames], t_mm[frames], motion_of(within, frames), usual_px
-            )
+        R[frames], t_mm[frames] = _smoothed(
+            run, parts, R[frames], t_mm[frames], motion_of(within, frames), usual_px
+        )
     return R, t_mm
 
 
@@ -78,13 +79,16 @@ def _bridged(run: RunIdentities, known: IntArray, frames: IntArray) -> tuple[Flo
 
 def _smoothed(
     run: RunIdentities,
-    frames: IntArray,
+    parts: list[IntArray],
     R: FloatArray,
     t_mm: FloatArray,
     within: LedMotion,
     usual_px: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return better poses of frames that follow each other."""
+    """Return better poses of the frames of all parts; those of a part follow each other."""
+    frames = np.concatenate(parts)
+    ends = np.cumsum([len(part) for part in parts]).tolist()
+    rows = [slice(end - len(part), end) for part, end in zip(parts, ends, strict=True)]
     lights = run.lights_of(frames)
     seen = all_finite(lights.uv_px) & lights.is_whole
     noise = np.where(seen[..., None, None], lights.cov_px2, 0.0) + usual_px[
@@ -93,7 +97,7 @@ def _smoothed(
     weight = np.where(seen[..., None, None], np.linalg.inv(noise), 0.0)
     for _ in range(_STEPS):
         A, g = _by_lights(run, R, t_mm, lights.uv_px, weight, within)
-        step = _step(A, g, _differences(R, t_mm))
+        step = np.concatenate([_step(A[i], g[i], _differences(R[i], t_mm[i])) for i in rows])
         R, t_mm = R @ matrix_from_rvec(step[:, :3]), t_mm + step[:, 3:]
     return R, t_mm
 
@@ -117,16 +121,18 @@ def _by_lights(
     r = uv_px - prediction.uv_px
     shown = all_finite(r) & all_finite(J, 2) & (prediction.facing > 0)
     r, J = np.where(shown[..., None], r, 0.0), np.where(shown[..., None, None], J, 0.0)
-    sigmas = np.sqrt(np.einsum("nli,nlij,nlj->nl", r, weight, r))
+    sigmas = np.sqrt(np.sum(r * (weight @ r[..., None])[..., 0], axis=-1))
     W = weight * np.minimum(1.0, _LIGHT_SIGMAS / np.maximum(sigmas, 1e-9))[..., None, None]
     J = np.concatenate([J, J * within.dt_s[..., None, None]], axis=-1)
-    JW = np.einsum("nlic,nlij->ncjl", J, W)
-    A = np.einsum("ncjl,nljd->ncd", JW, J)
-    g = np.einsum("ncjl,nlj->nc", JW, r)
+    n = len(J)
+    J, WJ, r = J.reshape(n, -1, 12), (W @ J).reshape(n, -1, 12), r.reshape(n, -1, 1)
+    A = J.swapaxes(1, 2) @ WJ
+    g = (WJ.swapaxes(1, 2) @ r)[..., 0]
     assert within.twist_sd is not None  # noqa: S101 - of a run
     A[:, range(6, 12), range(6, 12)] += 1 / within.twist_sd**2
     share = np.linalg.solve(A[:, 6:, 6:], A[:, 6:, :6])  # of the twist in what looks like a pose
-    return A[:, :6, :6] - A[:, :6, 6:] @ share, g[:, :6] - np.einsum("nji,nj->ni", share, g[:, 6:])
+    shared = np.swapaxes(share, 1, 2)
+    return A[:, :6, :6] - A[:, :6, 6:] @ share, g[:, :6] - (shared @ g[:, 6:, None])[..., 0]
 
 
 def _differences(R: FloatArray, t_mm: FloatArray) -> FloatArray:
@@ -146,14 +152,13 @@ def _step(A: FloatArray, g: FloatArray, differences: FloatArray) -> FloatArray:
     per = np.minimum(1.0, _DIFFERENCE_SIGMAS * usual / np.maximum(size, 1e-12)) / usual**2
     per = np.repeat(per, 3, axis=1)
     g = g.copy()
-    banded = np.zeros((30, 6 * n))  # the lower part: each row's distance below the diagonal
+    banded = np.zeros((30, n, 6))  # the lower part: each row's distance below the diagonal
     for row in range(6):
         for column in range(row + 1):
-            banded[row - column, column::6] += A[:, row, column]
+            banded[row - column, :, column] += A[:, row, column]
     for a, ca in enumerate(_DIFFERENCE):
         g[a : a + m] -= ca * per * differences
         for b, cb in enumerate(_DIFFERENCE[: a + 1]):
-            for c in range(6):
-                banded[6 * (a - b), 6 * b + c : 6 * (b + m) : 6] += ca * cb * per[:, c]
+            banded[6 * (a - b), b : b + m] += ca * cb * per
     banded[0] += 1e-9
-    return np.asarray(solveh_banded(banded, g.ravel(), lower=True).reshape(n, 6))
+    return np.asarray(solveh_banded(banded.reshape(30, -1), g.ravel(), lower=True).reshape(n, 6))
