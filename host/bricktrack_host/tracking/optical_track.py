@@ -114,9 +114,12 @@ def solve_poses(
         if motion is not None and newly.size:
             # Whatever motion was given, what a spline through the frames cannot follow here is in doubt.
             spline = motion if known_motion is None else motion_to_leds(t_ns, led_t_ns, R, t_mm)
-            twist_sd = np.zeros((newly.size, 6)) if spline.twist_sd is None else spline.twist_sd[newly]
+            twist_sd, jump_sd = (
+                np.zeros((newly.size, 6)) if sd is None else sd[newly]
+                for sd in (spline.twist_sd, spline.jump_sd)
+            )
             more = motion_doubt_px2(
-                motion, twist_sd, poses, newly, ray_model, brick_model, collar_mm=collar_mm
+                motion, jump_sd, poses, newly, ray_model, brick_model, collar_mm=collar_mm
             )
             moving = np.einsum("nlii->n", more) > np.einsum("nlii->n", np.nan_to_num(cov[newly]))
             cov[newly[moving]] += more[moving]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.estimate import fuse
 from bricktrack_host.fusion.inertial.imu_samples import clean_samples
-from bricktrack_host.fusion.pose_by_pose.gap_fill import fill_of_gaps
+from bricktrack_host.fusion.pose_by_pose.gap_fill import _as_felt, fill_of_gaps
 from bricktrack_host.quality import PoseFlag
 
 GAP_S = (2.5, 3.3)
@@ -77,3 +77,14 @@ def test_a_gap_through_which_the_camera_saw_nothing_is_not_filled():
     s = simulate_shake(1, imu_gaps=(GAP_S,), dropouts=((2.8, 3.0),), **KWARGS)
     assert filled(s)[1] is None
     assert filled(simulate_shake(1, **KWARGS))[1] is None
+
+
+def test_beside_what_the_camera_did_not_see_the_samples_are_told_as_well():
+    n, t_s = 60, 0.01 * np.arange(60)
+    level = np.tile(np.eye(3), (n, 1, 1))
+    acc = np.stack([np.sin(20 * t_s), np.cos(20 * t_s), np.zeros(n)], axis=1)
+    seen = np.arange(n) < 40
+    acc_seen = np.where(seen[:, None], acc, np.nan)
+    gravity = np.array([0.0, 0.0, 9.8])
+    felt = _as_felt(t_s, level, acc_seen, seen, acc[seen] + gravity)
+    assert felt[seen] == pytest.approx(acc[seen] + gravity, abs=1e-9)

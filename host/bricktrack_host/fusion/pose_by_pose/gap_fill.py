@@ -133,7 +133,7 @@ def _as_felt(
     against = np.median(np.einsum("nij,nj->ni", R[compared], acc_seen - moving[compared]), axis=0)
     force = moving + R_back @ against
     force += np.median(acc_seen - force[compared], axis=0)
-    rate = np.gradient(force, t_s, axis=0)
+    rate = np.nan_to_num(np.gradient(force, t_s, axis=0))  # unknown beside what the camera did not see
     size = float((rate[compared] ** 2).sum())
     lag_s = float((rate[compared] * (acc_seen - force[compared])).sum()) / size if size > 0 else 0.0
     return np.asarray(force + lag_s * rate)

@@ -18,6 +18,8 @@ from bricktrack_host.tracks import FusedTrack, LedObservations
 
 _MAX_GAP_PERIODS = 3.5  # wider gaps end a spline: a shaken brick turns back within them
 _SPLINE_SHARE = 0.1
+_FEWEST_FRAMES = 9  # of which five fourth differences are had: fewer may all be small by chance
+_SHAKE_RADPS = 54.0  # 8.6 Hz: the highest frequency of a shake that 30 frames a second follow
 _TWIST_FLOOR = np.array([0.005, 0.3])  # rad/s, mm/s: far below what moves a centroid within a frame
 _FUSED_TWIST_SD = np.repeat([0.03, 5.0], 3)  # rad/s, mm/s: of the fused motion between frames
 UNKNOWN_TWIST_SD = np.array([1.0, 1.0, 1.0, 300.0, 300.0, 300.0])
@@ -90,7 +92,7 @@ def motion_to_leds(
     """Return how far the brick moves from each frame's instant to each LED's, by splines over frames."""
     n, n_leds = led_t_ns.shape
     rvec, shift = np.zeros((n, n_leds, 3)), np.zeros((n, n_leds, 3))
-    twist_sd = np.tile(UNKNOWN_TWIST_SD, (n, 1))
+    twist_sd, jump_sd = np.tile(UNKNOWN_TWIST_SD, (2, n, 1))
     valid = np.flatnonzero(all_finite(R_camera_brick, 2))
     if valid.size >= 2:
         seconds = (t_ns - t_ns[valid[0]]) * 1e-9
@@ -107,12 +109,13 @@ def motion_to_leds(
             back = np.swapaxes(matrix_from_rvec(here[:, :3]), -1, -2)[:, None]
             rvec[part] = rvec_from_matrix(back @ matrix_from_rvec(there[..., :3]))
             shift[part] = there[..., 3:] - here[:, None, 3:]
-            twist_sd[part] = _twist_sd(samples, period)
+            twist_sd[part], jump_sd[part] = _spline_doubt(samples, seconds[part])
     return LedMotion(
         rvec_brick_rad=rvec,
         shift_camera_mm=shift,
         dt_s=np.asarray((led_t_ns - t_ns[:, None]) * 1e-9, dtype=np.float64),
         twist_sd=twist_sd,
+        jump_sd=jump_sd,
     )
 
 
@@ -142,7 +145,7 @@ def carried_px(
 
 def motion_doubt_px2(
     motion: LedMotion,
-    twist_sd: FloatArray,
+    jump_sd: FloatArray,
     poses: RefinedPoses,
     frames: IntArray,
     ray_model: RayModel,
@@ -150,12 +153,12 @@ def motion_doubt_px2(
     *,
     collar_mm: float | None,
 ) -> FloatArray:
-    """Return what a doubtful twist leaves of each LED's place, each for itself.
+    """Return what a sudden change of velocity leaves of each LED's place, each for itself.
 
     Parameters
     ----------
     motion : LedMotion
-    twist_sd : ndarray, shape (m, 6), rad/s and mm/s
+    jump_sd : ndarray, shape (m, 6), rad/s and mm/s
     poses : RefinedPoses
     frames : ndarray of int64, shape (m,)
         Those wanted; they have poses.
@@ -172,23 +175,33 @@ def motion_doubt_px2(
         brick_model,
         collar_mm=collar_mm,
     )
-    by_twist = J * (motion.dt_s[frames][..., None] * twist_sd[:, None])[:, :, None, :]
-    return np.asarray(by_twist @ np.swapaxes(by_twist, -1, -2))
+    by_jump = J * (motion.dt_s[frames][..., None] * jump_sd[:, None])[:, :, None, :]
+    return np.asarray(by_jump @ np.swapaxes(by_jump, -1, -2))
 
 
-def _twist_sd(samples: FloatArray, period_s: float) -> FloatArray:
-    """Return how wrong a cubic spline's velocity may be at each frame, shape (n, 6), rad/s and mm/s.
+def _spline_doubt(samples: FloatArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how wrong a cubic spline's velocity may be at each frame, and how far it may jump there.
 
-    For a sine of w T = 1.8 (8.6 Hz at 30 frames a second) it is 8.5 % off, which is 0.026 of the fourth
-    difference over T; at lower frequencies less, at an impact several times that. Ends know one side only.
+    Both have shape (n, 6), rad/s and mm/s. For a sine of w T = 1.8 (8.6 Hz at 30 frames a second) the
+    velocity is 8.5 % off, which is 0.026 of the fourth difference over T; at lower frequencies less, at an
+    impact several times that. Where frames are missing, such a sine turns back unseen between two of them:
+    then it is all of w times the amplitude that may be wrong, and the largest of five fourth differences is
+    about twenty amplitudes. Ends know one side only.
     """
-    n = len(samples)
-    if n < 5:
-        return np.tile(UNKNOWN_TWIST_SD, (n, 1))
+    n, apart_s = len(samples), np.diff(t_s)
+    if n < _FEWEST_FRAMES:
+        unknown = np.tile(UNKNOWN_TWIST_SD, (n, 1))
+        return unknown, unknown
     fourth = np.diff(samples, 4, axis=0)
     size = np.stack([np.linalg.norm(fourth[:, :3], axis=1), np.linalg.norm(fourth[:, 3:], axis=1)], axis=1)
-    near = np.pad(size, ((4, 4), (0, 0)), mode="edge")  # frame i is centred among those from i to i + 4
-    local = np.max([near[k : k + n] for k in range(5)], axis=0)
-    sd = np.maximum(_SPLINE_SHARE * local / period_s, _TWIST_FLOOR)
-    sd[[0, 1, -2, -1]] *= 3.0
-    return np.asarray(np.repeat(np.minimum(sd, UNKNOWN_TWIST_SD[[0, 3]]), 3, axis=1))
+    # Of a frame those five that it is in; of frames near an end those nearest to it.
+    near = np.max([size[k : k + n - 8] for k in range(5)], axis=0)
+    local = _SPLINE_SHARE * np.pad(near, ((4, 4), (0, 0)), mode="edge")
+    local[[0, 1, -2, -1]] *= 3.0
+    is_unseen = np.pad(_SHAKE_RADPS * apart_s > np.pi, 2, mode="edge")
+    is_near_unseen = np.any([is_unseen[k : k + n] for k in range(4)], axis=0)
+    jump = local / np.median(apart_s)
+    velocity = np.where(is_near_unseen[:, None], np.maximum(jump, 0.5 * _SHAKE_RADPS * local), jump)
+    least, most = _TWIST_FLOOR, UNKNOWN_TWIST_SD[[0, 3]]
+    velocity, jump = (np.repeat(np.clip(sd, least, most), 3, axis=1) for sd in (velocity, jump))
+    return velocity, jump

@@ -46,12 +46,15 @@ class LedMotion:
     twist_sd : ndarray, shape (n, 6), rad/s and mm/s, or None
         How well that motion is known, as a twist, and with it the twist's rate: the frame's own rows then
         correct both, as far as they can. `None`: the motion is taken as given.
+    jump_sd : ndarray, shape (n, 6), rad/s and mm/s, or None
+        How far a change of velocity may go that is sudden, as at an impact; `None`: not known.
     """
 
     rvec_brick_rad: FloatArray
     shift_camera_mm: FloatArray
     dt_s: FloatArray
     twist_sd: FloatArray | None = None
+    jump_sd: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
