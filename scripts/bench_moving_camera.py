@@ -10,7 +10,7 @@ Without ``--leds`` poses are fused (`tests/support/two_imus.py`, runs of 15 s). 
 impacts of up to 0.25 m/s and two dropouts of 0.5 s (`tests/support/daemon_runs.py`) are fused LED by LED, beside
 the fusion of their poses; in the second table of each kind of sensors two LEDs of seven remain in the dropouts.
 
-Run: ``python scripts/bench_moving_camera.py --seeds 6``, and ``--leds --seeds 4``
+Run: ``python scripts/bench_moving_camera.py --seeds 6``, and ``--leds --sensors exact --seeds 2``
 """
 
 import argparse
@@ -172,7 +172,7 @@ def tables(args: argparse.Namespace) -> Iterator[Table]:
     """Yield the tables asked for."""
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     settings = FusionSettings(sensor_gain_sd=0.0) if args.known else None
-    for sensors in ["exact"] if args.known else list(SENSORS):
+    for sensors in ["exact"] if args.known else args.sensors:
         for two_remain in (False, True) if args.leds else (False,):
             works = [
                 [Work(seed, motion, sensors, settings, two_remain) for seed in seeds] for motion in MOTIONS
@@ -193,6 +193,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=6, help="runs of each row")
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--known", action="store_true", help="scale and axes are known to be exact")
+    parser.add_argument("--sensors", nargs="+", choices=[*SENSORS], default=[*SENSORS])
     parser.add_argument("--leds", action="store_true", help="fuse LED by LED")
     args = parser.parse_args()
     logging.getLogger("bricktrack_host").setLevel(logging.ERROR)

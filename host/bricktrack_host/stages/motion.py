@@ -16,7 +16,7 @@ from bricktrack_host.fusion.optical.inertial_hint import InertialHint
 from bricktrack_host.fusion.optical.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.pose_by_pose.fused_output import unsure_times
 from bricktrack_host.fusion.sensor_agreement import doubt_about_camera_sensor
-from bricktrack_host.fusion.tight import fuse_tight
+from bricktrack_host.fusion.tight import TightResult, fuse_tight
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.daq_clock import EdgeFit
 from bricktrack_host.results.ray_errors import RayErrors
@@ -153,16 +153,17 @@ def fuse_run(
 ) -> tuple[dict[FusedKind, FusedTrack], FusionResult | None]:
     """Return the motion at the instants wanted: LED by LED where ``seen`` is given, else pose by pose."""
     wanted = np.concatenate(list(grid.t_ns.values()))
-    fusion = None
+    fusion, by_poses = None, None
     if inertial is not None and not inertial.is_hint and brick.imu_lever_arm_mm is not None:
         lever_arm_mm = brick.imu_lever_arm_mm
         try:
             if seen is None:
-                fusion = _by_poses(optical, inertial, lever_arm_mm, wanted)
+                fusion = by_poses = _by_poses(optical, inertial, lever_arm_mm, wanted)
             else:
-                fusion = _fuse_tight(
+                tight = _fuse_tight(
                     optical, inertial, brick, seen, wanted, problems, lever_arm_mm=lever_arm_mm
                 )
+                fusion, by_poses = tight.fused, tight.pose_level
         except (ShapeError, TrackingError) as e:
             problems.append(f"fusion was not possible, optical poses alone: {e}")
     if fusion is not None:
@@ -172,8 +173,8 @@ def fuse_run(
             problems.append(
                 f"{n_rejected} optical poses disagree with the IMU and their neighbours and were left out"
             )
-        if inertial is not None and inertial.camera is not None:
-            doubt = doubt_about_camera_sensor(fusion.gyro_noise, fusion.acc_noise)
+        if by_poses is not None and inertial is not None and inertial.camera is not None:
+            doubt = doubt_about_camera_sensor(by_poses.gyro_noise, by_poses.acc_noise)
             problems.extend([] if doubt is None else [doubt])
     else:
         hint = InertialHint(inertial.imu, inertial.alignment) if inertial and inertial.is_hint else None
@@ -195,7 +196,7 @@ def _fuse_tight(
     problems: list[str],
     *,
     lever_arm_mm: FloatArray,
-) -> FusionResult:
+) -> TightResult:
     observations, rays = seen
     tight = fuse_tight(
         observations, optical, inertial.imu, rays, brick,
@@ -213,7 +214,7 @@ def _fuse_tight(
             f"fusion LED by LED and pose by pose are up to {tight.check.max_mm:.2f} mm apart, in "
             f"{100 * tight.check.share_apart:.0f} % of the instants by more than their uncertainty allows"
         )
-    return tight.fused
+    return tight
 
 
 def with_ray_errors(

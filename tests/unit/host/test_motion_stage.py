@@ -1,0 +1,37 @@
+"""What the stage of the motion says of a camera's sensor that does not fit (simulated)."""
+
+from dataclasses import replace
+
+import numpy as np
+from daemon_runs import simulate_run
+from scipy.spatial.transform import Rotation
+
+from bricktrack_host.fusion.pose_by_pose.moving_camera import align_both
+from bricktrack_host.stages.clocks import Inertial
+from bricktrack_host.stages.motion import OutputGrid, fuse_run
+from bricktrack_host.tracking.optical_track import solve_poses
+
+
+def test_a_camera_sensor_in_wrong_axes_is_doubted_though_leds_are_followed():
+    run = simulate_run(
+        13, duration_s=4.0, amplitude_mm=5.0, camera_acc_g=0.3, camera_rocking_deg=1.0, has_camera_imu=True
+    )
+    optical = solve_poses(run.observations, run.camera, run.brick)
+    samples = run.camera_imu.imu
+    down = np.median(samples.acc_mps2, axis=0)
+
+    def said(angle_deg):
+        # About gravity: both accelerometers agree about that.
+        R = Rotation.from_rotvec(np.radians(angle_deg) * down / np.linalg.norm(down)).as_matrix()
+        turned = replace(samples, acc_mps2=samples.acc_mps2 @ R.T, gyro_radps=samples.gyro_radps @ R.T)
+        sensor, problems = replace(run.camera_imu, imu=turned), []
+        both = align_both(optical, run.imu, sensor)
+        fuse_run(
+            optical, Inertial(run.imu, both.brick, sensor, both), run.brick,
+            OutputGrid({"frame": optical.t_ns}, np.empty(0, dtype=np.int64)), problems,
+            seen=(run.observations, run.camera),
+        )  # fmt: skip
+        return " ".join(problems)
+
+    assert "does not fit" not in said(0)
+    assert "does not fit" in said(15)
