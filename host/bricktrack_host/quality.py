@@ -30,7 +30,8 @@ class PoseFlag(IntFlag):
     NO_POSE = 1
     """No pose could be had; its values are NaN."""
     FRAME_LOST = 2
-    """The frame was dropped by the camera, or its bytes are damaged or missing."""
+    """The frame was dropped by the camera, its bytes are damaged or missing, or its picture is a copy of
+    the one before."""
     LED_MISSING = 4
     """At least one LED is not used in this pose."""
     AMBIGUOUS = 8

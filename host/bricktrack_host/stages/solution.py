@@ -38,6 +38,7 @@ from bricktrack_host.stages.motion import (
 from bricktrack_host.stages.progress import Stages
 from bricktrack_host.stages.settings import ProcessSettings
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
+from bricktrack_host.tracking.copied_frames import with_copied_frames_left_out
 from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_fit import with_profile_of_run
 from bricktrack_host.tracking.odd_leds import with_odd_leds_doubted, words_on_odd_leds
@@ -83,6 +84,8 @@ def solve_run(
         If no pose can be believed.
     """
     with stages("solve poses"):
+        observations, copies = with_copied_frames_left_out(observations)
+        problems += copies
         first = start_poses(observations, rays, brick, form=settings.prsoi_form)
         brick = with_profile_of_run(
             observations, first, rays, brick, rolling_shutter=settings.rolling_shutter
