@@ -91,7 +91,7 @@ def show(
         bricktrack keys show --output lab.key
     """
     path = _key_path(file, _fleet_if_any(fleet))
-    public = read_secret_key(path).public
+    public = _own_key(path).public
     if output is not None:
         if output.suffix != PUBLIC_SUFFIX:
             raise ConfigError(
@@ -171,7 +171,7 @@ def install(
             f"{path}: names no key of this host. Make one with 'bricktrack keys create' and name it under "
             f'[host]: secret_key = "{DEFAULT_KEY}"'
         )
-    own = read_secret_key(_key_path(file, chosen))
+    own = _own_key(_key_path(file, chosen))
     selected = _selected(chosen, units, ssh)
     failed = 0
     for unit in selected:  # one after another, with no bar: SSH may ask for passwords
@@ -209,7 +209,7 @@ def rotate(
     """
     chosen = load_fleet(fleet_path(fleet))
     path = _key_path(file, chosen)
-    old, new = read_secret_key(path), next_host_key(path, name=_host_name())
+    old, new = _own_key(path), next_host_key(path, name=_host_name())
     keyed = [u for u in _selected(chosen, None, ssh) if u.server_key]
     if not keyed:
         raise ConfigError("no unit of the fleet has a key; 'bricktrack keys install' gives it one")
@@ -259,6 +259,12 @@ def _remote(ssh: str, unit: UnitConfig, command: str, folder: str) -> RemoteUnit
 def _key_path(file: Path | None, fleet: Fleet | None) -> Path:
     named = fleet.host.secret_key_path if fleet is not None else None
     return (file or named or DEFAULT_KEY).expanduser()
+
+
+def _own_key(path: Path) -> KeyPair:
+    if not path.exists():
+        raise ConfigError(f"{path}: this host has no key yet. Make it with 'bricktrack keys create'")
+    return read_secret_key(path)
 
 
 def _fleet_if_any(fleet_file: Path | None) -> Fleet | None:

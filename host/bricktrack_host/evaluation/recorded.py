@@ -11,6 +11,7 @@ from bricktrack_common.errors import ConfigError
 from bricktrack_common.rotations import matrix_from_rvec, nearest_rotation, rvec_from_matrix
 from bricktrack_host.evaluation.scores import SweepScore, score_sweep
 from bricktrack_host.evaluation.sweeps import Sweep
+from bricktrack_host.recordings.timed_csv import refuse_longer_rows, refuse_other_separator
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import OpticalTrack
 
@@ -48,12 +49,17 @@ def read_positions(path: Path) -> ReferencePositions:
     ------
     ConfigError
         If the file cannot be read, a column is missing, a value is no number, or a rest ends too early.
+    RunFormatError
+        If its fields are parted by anything but commas, or a row has more of them than the first line.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+            reader = csv.DictReader(file)
+            header, rows = list(reader.fieldnames or ()), list(reader)
     except (OSError, UnicodeDecodeError) as e:
         raise ConfigError(f"{path}: cannot be read as CSV: {e}") from e
+    refuse_other_separator(path, header)
+    refuse_longer_rows(path, rows)
     wanted = ("start_s", "end_s", *_POSITION)
     missing = [c for c in wanted if not rows or c not in rows[0]]
     if missing or len(rows) < 2:

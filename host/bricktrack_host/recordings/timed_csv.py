@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -111,6 +111,22 @@ def refuse_other_separator(path: Path, header: list[str]) -> None:
             raise RunFormatError(
                 f"{path}: fields are parted by {name}. Write it again with commas between the fields, and "
                 "points in the numbers"
+            )
+
+
+def refuse_longer_rows(path: Path, rows: Sequence[Mapping[str | None, object]]) -> None:
+    """Refuse rows, as `csv.DictReader` gives them, with more fields than the first line names.
+
+    Raises
+    ------
+    RunFormatError
+        With the row's number: numbers with a decimal comma would be read as two.
+    """
+    for i, row in enumerate(rows, 1):
+        if None in row:
+            raise RunFormatError(
+                f"{path}: row {i} has more fields than the first line names. Write numbers with points, and "
+                "commas between the fields only"
             )
 
 

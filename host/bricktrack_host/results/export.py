@@ -38,7 +38,7 @@ def read_run_table(results: Path, table: str) -> "pa.Table":
     path = results / f"{name}.parquet"
     if not path.is_file():
         raise RunFormatError(
-            f"{path}: no such table. Process the run first; one without '{name}' leaves it out"
+            f"{path}: no such table. Process the run first; if that was done, it has nothing for '{name}'"
         )
     whole = read_parquet(path)
     if table != "samples":

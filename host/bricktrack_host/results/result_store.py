@@ -326,7 +326,8 @@ def read_result(folder: Path) -> RunResult:
 def _read_summary(folder: Path) -> _Summary:
     path = folder / SUMMARY_NAME
     if not path.is_file():
-        raise RunFormatError(f"{folder}: no {SUMMARY_NAME}; this is no results folder. Process the run first")
+        lacks = f"no {SUMMARY_NAME}; this is no results folder" if folder.is_dir() else "no such folder"
+        raise RunFormatError(f"{folder}: {lacks}. Process the run first")
     head = load_json(path, dict[str, Any])
     if head.get("schema") != RESULTS_SCHEMA or not isinstance(head.get("version"), int):
         raise RunFormatError(f"{path}: not a {RESULTS_SCHEMA} summary")

@@ -10,6 +10,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.rotations import matrix_from_quaternion, matrix_from_rvec, rvec_from_matrix
+from bricktrack_host.recordings.timed_csv import refuse_longer_rows, refuse_other_separator
 
 _MATCH_NS = 50_000  # 0.25 m/s makes this 0.0125 mm: more would not be the same instant
 _MAX_STEP_NS = 5_000_000  # farther apart, samples are single poses and not a motion
@@ -131,17 +132,20 @@ def _read_npz(path: Path) -> TrueMotion:
 def _read_csv(path: Path) -> TrueMotion:
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+            reader = csv.DictReader(file)
+            header, rows = list(reader.fieldnames or ()), list(reader)
     except (OSError, UnicodeDecodeError, csv.Error) as e:
         raise RunFormatError(f"{path}: not a readable truth file: {e}") from e
     if not rows:
         raise RunFormatError(f"{path}: no rows")
+    refuse_other_separator(path, header)
+    refuse_longer_rows(path, rows)
     clock = next((c for c in ("t_cam_ns", "t_mid_ns", "t_us") if c in rows[0]), None)
     if clock == "t_us" and "t_mid_ns" in rows[0]:
         clock = "t_mid_ns"
     missing = {"x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"} - set(rows[0])
     if clock is None or missing:
-        raise RunFormatError(f"{path}: columns {sorted(rows[0])}; missing {sorted(missing) or 'a time'}")
+        raise RunFormatError(f"{path}: columns {header}; missing {sorted(missing) or 'a time'}")
     try:
         # Whole nanoseconds are read as integers: a float would lose some of them.
         t_ns = np.array([int(r[clock]) * (1000 if clock == "t_us" else 1) for r in rows], dtype=np.int64)

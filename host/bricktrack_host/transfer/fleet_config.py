@@ -127,6 +127,8 @@ def load_fleet(path: Path) -> Fleet:
         If it cannot be read, has an unknown, missing or wrong key, a name, address or server key twice, or
         server keys without this host's own.
     """
+    if not path.exists():
+        raise ConfigError(f"no fleet file {path}. Write one, or name another with --fleet")
     fleet = load_toml(path, Fleet)
     base = path.resolve().parent
     seen: dict[str, set[str]] = {"name": set(), "address": set(), "server_key": set()}

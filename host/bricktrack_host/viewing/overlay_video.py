@@ -58,9 +58,9 @@ def write_overlay(
     result = read_result(results_folder)
     video, stamps, mode = video_of(run, result)
     first, stop = frames or (0, stamps.n_frames)
+    if not 0 <= first < min(stop, stamps.n_frames):
+        raise RunFormatError(f"frames {first}:{stop}: the run has frames 0 to {stamps.n_frames - 1}")
     stop = min(stop, stamps.n_frames)
-    if not 0 <= first < stop:
-        raise RunFormatError(f"frames {first} to {stop}: the run has frames 0 to {stamps.n_frames - 1}")
     artist = OverlayArtist.of(result, mode.width, mode.height, frames=(first, stop))
     partial = output.with_name(f".{output.name}.partial")
     n = 0

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from small_lab import invented_run
 from typer.testing import CliRunner
 
-from bricktrack_common.errors import ConfigError
+from bricktrack_common.errors import ConfigError, RunFormatError
 from bricktrack_host.cli.main import app
 from bricktrack_host.evaluation import filmed, filmed_sweeps
 from bricktrack_host.evaluation.bound import cramer_rao_covariance
@@ -254,3 +254,10 @@ def test_sweeps_of_two_lenses_are_one_table():
     )
     # (0.1 mm)^2 over 0.01 mm^2 is one, (0.2 mm)^2 four; the first step of each is right.
     assert nees_per_dof([both]) == pytest.approx((1 + 4) * (n - 1) / (2 * n) / 6)
+
+
+def test_positions_with_semicolons_are_told_so(tmp_path):
+    file = tmp_path / "stage.csv"
+    file.write_text("start_s;end_s;x_mm;y_mm;z_mm\n0,5;1,2;0;0;0\n1,9;2,6;1;0;0\n")
+    with pytest.raises(RunFormatError, match="parted by semicolons"):
+        read_positions(file)

@@ -15,6 +15,7 @@ from bricktrack_host.assemblies.combined_test import combine_test, read_componen
 from bricktrack_host.cli.main import app
 from bricktrack_host.results.daq_table import join_samples, read_daq_csv
 from bricktrack_host.results.export import read_run_table, write_table
+from bricktrack_host.results.result_store import read_result
 
 
 def invoke(*words):
@@ -157,3 +158,10 @@ def test_commands_name_what_is_wrong(lab, tmp_path):
     assert "no such table" in " ".join(nothing.output.split())
     component = invoke("export", runs[0], "--component", "B")
     assert "are for tests" in " ".join(component.output.split())
+
+
+def test_what_is_no_results_folder_is_told_from_what_is_not_there(tmp_path):
+    with pytest.raises(RunFormatError, match=r"nowhere: no such folder\. Process"):
+        read_result(tmp_path / "nowhere")
+    with pytest.raises(RunFormatError, match=r"no summary\.json"):
+        read_result(tmp_path)

@@ -83,3 +83,8 @@ def test_a_unit_that_calls_itself_otherwise_is_refused(tmp_path):
     check_name(HelloReply(unit="b1", software="", simulated=True), unit, unit.address)
     with pytest.raises(ConfigError, match=r"calls itself 'b2'; the fleet file calls it 'b1'"):
         check_name(HelloReply(unit="b2", software="", simulated=True), unit, unit.address)
+
+
+def test_a_fleet_file_that_is_not_there_is_told_with_the_remedy(tmp_path):
+    with pytest.raises(ConfigError, match=r"no fleet file .*nowhere\.toml.*--fleet"):
+        load_fleet(tmp_path / "nowhere.toml")

@@ -171,3 +171,17 @@ def test_truth_of_single_frames_is_given_at_their_instants_only():
     np.testing.assert_array_equal(t_mm[0], static.t_camera_brick_mm[3])
     np.testing.assert_array_equal(t_mm[1], static.t_camera_brick_mm[3])
     assert np.isnan(t_mm[2]).all()
+
+
+def test_a_truth_file_with_semicolons_is_told_so(tmp_path):
+    file = tmp_path / "truth.csv"
+    file.write_text("t_us;x_mm;y_mm\n0;1,5;2\n")
+    with pytest.raises(RunFormatError, match="parted by semicolons"):
+        read_true_motion(file)
+
+
+def test_a_truth_file_with_decimal_commas_is_told_so(tmp_path):
+    file = tmp_path / "truth.csv"
+    file.write_text("t_us,x_mm,y_mm,z_mm,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n1,1,5,2,3,1,0,0,0\n")
+    with pytest.raises(RunFormatError, match="row 2 has more fields"):
+        read_true_motion(file)
