@@ -222,7 +222,8 @@ class _Scales:
 
 def _whole(position_pt: FloatArray) -> IntArray:
     # Far outside the panel is as good as a little outside; NaN is nowhere that anyone looks.
-    return np.rint(np.clip(np.nan_to_num(position_pt), -1e4, 1e4) * UNITS_PER_PT).astype(np.int64)
+    near: FloatArray = np.clip(np.where(np.isnan(position_pt), 0.0, position_pt), -1e4, 1e4)
+    return np.rint(near * UNITS_PER_PT).astype(np.int64)
 
 
 def _panel_svg(panel: Panel, x_limits: tuple[float, float], number: int) -> str:

@@ -136,14 +136,14 @@ class Scatter:
         known = np.isfinite(self.x) & np.isfinite(self.y)
         # A stroke of no length with round ends is a dot; all of them are one path.
         steps = _steps(to_page(self.x[known], self.y[known]))
-        path = "".join(f"m{u} {v}h0" for u, v in steps)
+        path = _repeated("m%d %dh0", steps)
         opacity = f' stroke-opacity="{self.opacity:g}"' if self.opacity < 1 else ""
         dots = f'<path {_stroke(self.colour, self.size_pt)} stroke-linecap="round"{opacity} d="{path}"/>'
         if self.half is None:
             return dots
         x, y, half = self.x[known], self.y[known], self.half[known]
-        ends = np.concatenate([to_page(x, y - half), to_page(x, y + half)], axis=1).tolist()
-        bars = "".join(f"M{u} {v}V{to}" for u, v, _, to in ends)
+        from_, to = to_page(x, y - half), to_page(x, y + half)
+        bars = _repeated("M%d %dV%d", np.concatenate([from_, to[:, 1:]], axis=1))
         return f'<path {_stroke(self.colour, 0.8)} d="{bars}"/>{dots}'
 
     def swatch(self, x: int, y: int, width: int) -> str:
@@ -335,9 +335,13 @@ def polyline(points: IntArray) -> str:
     return f"M{u} {v}l0 0" if not len(steps) else f"M{u} {v}l{' '.join(map(str, steps.ravel().tolist()))}"
 
 
-def _steps(points: IntArray) -> list[list[int]]:
-    steps: list[list[int]] = np.diff(points, axis=0, prepend=np.zeros((1, 2), dtype=np.int64)).tolist()
-    return steps
+def _steps(points: IntArray) -> IntArray:
+    return np.diff(points, axis=0, prepend=np.zeros((1, 2), dtype=np.int64))
+
+
+def _repeated(pattern: str, rows: IntArray) -> str:
+    """Return a pattern filled in with each row; at once, as there may be ten thousands."""
+    return (pattern * len(rows)) % tuple(rows.ravel().tolist())
 
 
 def _runs(known: BoolArray) -> list[slice]:
