@@ -16,6 +16,7 @@ import numpy as np
 from av.codec.context import ThreadType
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
+from av.video.plane import VideoPlane
 
 from bricktrack_common.errors import VideoError
 from bricktrack_common.frame_times import FrameTimes
@@ -200,7 +201,7 @@ class _Decoding:
             i,
             int(self._frames.sensor_timestamp_ns[i]),
             int(self._frames.exposure_us[i]),
-            Picture(*(_plane_view(frame, k) for k in range(3))),
+            Picture(*map(_plane_view, frame.planes)),
             color_range=color_range or "unknown",
         )
 
@@ -230,10 +231,10 @@ def _open_decoder(threads: int) -> VideoCodecContext:
     return codec
 
 
-def _plane_view(frame: VideoFrame, k: int) -> Plane:
-    """Return plane ``k`` without a copy; its rows are ``line_size`` bytes apart."""
-    plane = frame.planes[k]
-    whole: Plane = np.frombuffer(memoryview(plane), dtype=np.uint8, count=plane.line_size * plane.height)
-    view = whole.reshape(plane.height, plane.line_size)[:, : plane.width]
+def _plane_view(plane: VideoPlane) -> Plane:
+    """Return a plane without a copy; its rows are ``line_size`` bytes apart."""
+    stride, rows = plane.line_size, plane.height
+    whole: Plane = np.frombuffer(memoryview(plane), dtype=np.uint8, count=stride * rows)
+    view = whole.reshape(rows, stride)[:, : plane.width]
     view.flags.writeable = False  # later pictures are predicted from this memory
     return view
