@@ -76,21 +76,33 @@ def test_one_or_two_leds_hold_the_motion_where_no_pose_can_be_had():
     assert rms(tight) < 0.1 * rms(poses)
 
 
+TWO_REMAIN = {
+    "duration_s": 3.5,
+    "amplitude_mm": 5.0,
+    "hidden_leds": tuple((name, 1.5, 0.6) for name in LEDS if name not in ("m1", "m5")),
+}
+
+
+@pytest.fixture(scope="module")
+def error_at_rest_mm():
+    rest = simulate_run(21, **TWO_REMAIN)
+    return rms(squared_mm(rest, fused(rest).fused.track))
+
+
 @pytest.mark.parametrize(("kind", "rocking_deg"), [("imu", 1.5), ("table", 0.0)])
-def test_a_camera_that_moves_sees_two_leds_as_well_as_one_at_rest(kind, rocking_deg):
-    hidden = tuple((name, 2.0, 0.8) for name in LEDS if name not in ("m1", "m5"))
-    shake = {"duration_s": 4.5, "hidden_leds": hidden, "amplitude_mm": 5.0}
-    rest = simulate_run(21, **shake)
-    run = simulate_run(21, camera_acc_g=0.3, camera_rocking_deg=rocking_deg, has_camera_imu=True, **shake)
+def test_a_camera_that_moves_sees_two_leds_as_well_as_one_at_rest(kind, rocking_deg, error_at_rest_mm):
+    run = simulate_run(
+        21, camera_acc_g=0.3, camera_rocking_deg=rocking_deg, has_camera_imu=True, **TWO_REMAIN
+    )
     sensor = replace(run.camera_imu, kind=kind)
     if kind == "table":
         sensor = replace(sensor, imu=replace(sensor.imu, gyro_radps=np.zeros_like(sensor.imu.gyro_radps)))
     result = fused(run, sensor=sensor)
     since = run.world.since_first_edge_s(result.fused.track.t_ns)
-    inside = (since > 2.05) & (since < 2.75)
+    inside = (since > 1.55) & (since < 2.05)
     tight, poses = (squared_mm(run, r.track) for r in (result.fused, result.pose_level))
-    # What is seen is the same, but a second sensor's noise comes in: 19 % more in this run.
-    assert rms(tight) < 1.3 * rms(squared_mm(rest, fused(rest).fused.track))
+    # What is seen is the same, but a second sensor comes in: a fifth more in a run like this.
+    assert rms(tight) < 1.3 * error_at_rest_mm
     assert rms(tight[inside]) < 0.2 * rms(poses[inside])
     assert (normalised(run, result.fused.track) < 12.59).mean() > 0.9
     assert result.check.agrees
