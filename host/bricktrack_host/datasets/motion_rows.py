@@ -135,6 +135,9 @@ def _camera_rows(source: UnitSource, result: RunResult) -> dict[str, Any]:
         for name in table.column_names
         if name in motion_schema().names and name != "sample"
     }
+    for axis in "xyz":  # motion here is from rest; results of version 1 have the camera's own deviation alone
+        if f"sd_drot_{axis}_deg" in table.column_names:
+            rows[f"sd_rot_{axis}_deg"] = table.column(f"sd_drot_{axis}_deg").combine_chunks()
     hz = result.manifest.trigger.nominal_hz
     rows["sample"] = sample
     rows["lab_s"] = np.full(len(sample), np.nan) if hz is None else sample / hz

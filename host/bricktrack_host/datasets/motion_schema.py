@@ -80,9 +80,9 @@ COLUMNS: tuple[MotionColumn, ...] = (
     *_vector(
         "sd_d{}_mm",
         "mm",
-        "standard deviation of the displacement; the rest pose's own is in it only if seen from the base",
+        "standard deviation of the displacement; the rest pose's own is in it",
     ),
-    *_vector("sd_rot_{}_deg", "deg", "standard deviation of the rotation, axes of what moves"),
+    *_vector("sd_rot_{}_deg", "deg", "standard deviation of the rotation from rest, axes of what moves"),
     *_vector(
         "dv_{}_mmps", "mm/s", "velocity of the first LED, brick axes at rest; NaN if seen from the base"
     ),

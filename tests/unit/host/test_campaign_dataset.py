@@ -77,6 +77,9 @@ def test_rows_seen_from_the_camera_are_those_of_the_run(lab, campaign):
     assert rows.num_rows == run.num_rows
     for name in ("t_ns", "dx_mm", "drvec_z_rad", "sd_dy_mm", "dv_z_mmps", "omega_x_radps", "flags"):
         np.testing.assert_array_equal(rows.column(name).to_numpy(), run.column(name).to_numpy(), err_msg=name)
+    for axis in "xyz":  # from rest, as the rotation itself
+        np.testing.assert_array_equal(rows.column(f"sd_rot_{axis}_deg"), run.column(f"sd_drot_{axis}_deg"))
+    assert rows.column("sd_rot_x_deg") != run.column("sd_rot_x_deg")
     at_edge = np.array(rows.column("kind").to_pylist()) == "edge"
     number = [x for x in run.column("edge_index").to_pylist() if x is not None]
     assert rows.column("sample").to_numpy()[at_edge].tolist() == number
