@@ -35,9 +35,9 @@ logger = logging.getLogger(__name__)
 _FEWEST_ROWS = 120  # second differences of positions: four seconds in view
 _MOST_COPIES = 8
 _STANDS_OUT = 12.0  # power of a copy over the median nearby; of 8000 by chance the greatest is at 4
-# Frequencies tried, of which 8192 are from zero to the rate: within 1.2 Hz. What camera and samples make of a
+# Frequencies tried, of which 8192 are from zero to the rate: within 2.4 Hz. What camera and samples make of a
 # motion differs more where there is more motion, and beside a wider stretch its ripples would stand out too.
-_NEARBY = 201
+_NEARBY = 401
 _N_TRIED = 8192
 _MOST_HZ = 12.0  # beyond, the camera tells little, and little is left once integrated
 _OF_FRAME_RATE = 0.45
