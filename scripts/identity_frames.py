@@ -20,6 +20,8 @@ from bricktrack_host.tracking.pictures.segment import Blobs
 COLLAR_MM = 0.7
 N_FALSE = 5
 _FALSE_AREA_PX2 = (900.0, 6000.0)
+BESIDE_PX = 40.0
+_PICTURE_PX = np.array([[20.0, 20.0], [1900.0, 1060.0]])  # where false lights are
 _APART_PX = 80.0  # an LED's diameter and some: nearer lights run together
 _AREA_SD = 0.1  # of the logarithm: what exposure and threshold make of an outline
 _CHUNK = 2000
@@ -162,10 +164,16 @@ def searched(
     *,
     noise_px: float = 0.05,
     mirrors: bool = False,
+    beside: bool = False,
     fitted: bool = True,
     speed_mm_s: float = 0.0,
 ) -> Outcome:
-    """Identify frames from nothing, each for itself; at a speed, the brick moves within each some other way."""
+    """Identify frames from nothing, each for itself; at a speed, the brick moves within each some other way.
+
+    ``mirrors``: the false lights are mirror images. ``beside``: one of them is within `BESIDE_PX` of where a
+    hidden LED would be seen, as in every `one_beside_in`-th frame by chance: wrong ones become frequent enough to
+    be counted.
+    """
     out = Outcome()
     while n > 0:
         m = min(n, _CHUNK)
@@ -177,6 +185,9 @@ def searched(
         for i in range(m):
             shown = np.sort(rng.permutation(brick.n_leds)[n_hidden:])
             false = mirrored(R[i], t[i], brick, camera, rng) if mirrors else _anywhere(rng, uv[i, shown])
+            if beside:
+                hidden = np.setdiff1d(np.arange(brick.n_leds), shown)
+                false[0] = _beside(rng, uv[i, rng.choice(hidden)], uv[i, shown], false[0])
             frames.append(picture(uv[i], area[i], shown, false, noise_px, rng))
         start = time.process_time()
         found = search_correspondences(
@@ -243,11 +254,27 @@ def tracked(
     return out
 
 
+def one_beside_in(n_hidden: int) -> float:
+    """Return in one frame of how many a false light that fell anywhere is beside a hidden LED."""
+    share = np.pi * BESIDE_PX**2 / np.prod(_PICTURE_PX[1] - _PICTURE_PX[0])
+    return float(1 / (N_FALSE * n_hidden * share))
+
+
+def _beside(
+    rng: np.random.Generator, hidden_px: FloatArray, leds_px: FloatArray, otherwise_px: FloatArray
+) -> FloatArray:
+    """Return a place beside a hidden LED, shape (2,), px; the other one where that touches an LED shown."""
+    angle, away = rng.uniform(0, 2 * np.pi), BESIDE_PX * np.sqrt(rng.uniform())
+    place = hidden_px + away * np.array([np.cos(angle), np.sin(angle)])
+    touches = (np.linalg.norm(leds_px - place, axis=-1) < _APART_PX).any()
+    return otherwise_px if touches else place
+
+
 def _anywhere(rng: np.random.Generator, leds_px: FloatArray) -> FloatArray:
     """Return places of false lights, shape (N_FALSE, 2), px, that touch no LED shown: they would be one light."""
     places = np.full((N_FALSE, 2), np.nan)
     touching = np.ones(N_FALSE, dtype=bool)
     while touching.any():
-        places[touching] = rng.uniform([20, 20], [1900, 1060], (touching.sum(), 2))
+        places[touching] = rng.uniform(*_PICTURE_PX, (touching.sum(), 2))
         touching = (np.linalg.norm(places[:, None] - leds_px, axis=-1) < _APART_PX).any(axis=1)
     return places
