@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.compiled import compiled, compiled_sums
+from bricktrack_host.compiled import compiled, compiled_inline, compiled_sums
 from bricktrack_host.fusion.inertial.rotation_kernel import turn_by, write_rotation_vector
 from bricktrack_host.fusion.smoothing.covariance_kernel import N
 
@@ -84,7 +84,7 @@ def _swing(w: Any, arm: Any, out: Any) -> None:
     out[2] = w[1] * arm[0] - w[0] * arm[1]
 
 
-@compiled_sums
+@compiled_inline
 def observe_pose(
     R: Any,
     x: Any,
@@ -128,7 +128,7 @@ def observe_pose(
     write_rotation_vector(ahead, R_seen, y)
 
 
-@compiled_sums
+@compiled_inline
 def place_led(
     leds: LedArrays,
     m: int,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_host.compiled import compiled, compiled_sums
+from bricktrack_host.compiled import compiled, compiled_inline, compiled_sums
 from bricktrack_host.fusion.inertial.rotation_kernel import turn_by
 from bricktrack_host.fusion.smoothing.covariance_kernel import (
     F_SIZE,
@@ -116,7 +116,7 @@ def measurements_of(run: RunArrays, start: int, stop: int) -> int:
     return int(n)
 
 
-@compiled_sums
+@compiled_inline
 def _correct(C: Any, n: int, chi2_95: float, R: Any, x: Any, P: Any, room: Room, kept: Kept, m: int) -> Any:
     """Take in ``n`` residuals with their Jacobian, as in ``room``, and covariance C, in place.
 
@@ -166,7 +166,7 @@ def _correct(C: Any, n: int, chi2_95: float, R: Any, x: Any, P: Any, room: Room,
     return nis, log_det, inflation
 
 
-@compiled_sums
+@compiled_inline
 def take_in(
     run: RunArrays,
     k: int,

@@ -6,7 +6,7 @@ The equations are DESIGN 8.2's, the layout of the 22 states is `smoother`'s.
 from typing import Any, NamedTuple
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.compiled import compiled_sums
+from bricktrack_host.compiled import compiled_inline
 from bricktrack_host.fusion.inertial.rotation_kernel import orthonormalise
 from bricktrack_host.fusion.smoothing.covariance_kernel import propagate
 from bricktrack_host.fusion.smoothing.observation_kernel import LedArrays
@@ -41,7 +41,7 @@ class RunArrays(NamedTuple):
     leds: LedArrays
 
 
-@compiled_sums
+@compiled_inline
 def transition(run: RunArrays, k: int, R: Any, F: Any) -> None:
     """Write the moving rows of the transition from node ``k`` to the next, for attitude R.
 
@@ -79,7 +79,7 @@ def transition(run: RunArrays, k: int, R: Any, F: Any) -> None:
         F[v, 15 + i] = dt
 
 
-@compiled_sums
+@compiled_inline
 def _move(run: RunArrays, k: int, R: Any, x: Any, F: Any) -> None:
     """Carry the state over one step; biases, lag and loss act as far as they are from where F was taken."""
     dt, step, known = run.dt_s[k], run.R_step[k], run.known[k]
@@ -107,7 +107,7 @@ def _move(run: RunArrays, k: int, R: Any, x: Any, F: Any) -> None:
     orthonormalise(R)
 
 
-@compiled_sums
+@compiled_inline
 def move_to(
     run: RunArrays,
     k: int,
