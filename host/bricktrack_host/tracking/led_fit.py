@@ -130,10 +130,14 @@ def fit_collar(
     if -_BARELY_NEGATIVE_MM <= collar < 0:
         collar = 0.0  # a bare dome whose limb is not as dark as its middle is bright
     if not 0 <= collar <= longest:
-        raise CalibrationError(
-            f"fitted collar is {collar:.3f} mm; expected 0 to {longest:g} mm. Check the LEDs' axes and "
-            "radii in the layout, and the calibration."
+        what = (
+            "The light lies farther in front than a half sphere's: the domes are taller, or the layout's "
+            "positions lie behind the middles of their spheres. Correct the positions; or process with the "
+            "layout as it is, whose covariances hold that the shape is unknown"
+            if collar < 0
+            else "Check the LEDs' axes and radii in the layout, and the calibration"
         )
+        raise CalibrationError(f"fitted collar is {collar:.3f} mm; expected 0 to {longest:g} mm. {what}.")
     residual, slope = problem.projected(collar)
     information = np.nansum(slope**2, axis=1)
     score = np.nansum(slope * residual, axis=1)
