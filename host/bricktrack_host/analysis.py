@@ -27,7 +27,7 @@ import pyarrow.dataset
 from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_host.assemblies.combined_test import TestSummary, read_components, read_test
+from bricktrack_host.assemblies.combined_summary import TestSummary, read_components, read_test
 from bricktrack_host.assemblies.motion_history import (
     HistoryError,
     MotionHistory,

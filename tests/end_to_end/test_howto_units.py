@@ -16,7 +16,7 @@ from small_lab import example
 
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_device.timing import imu_test
-from bricktrack_host.assemblies.combined_test import read_test
+from bricktrack_host.assemblies.combined_summary import read_test
 from bricktrack_host.calibration.calibration_file import load_calibration
 from bricktrack_host.calibration.target.printed_target import load_target
 from bricktrack_host.cli import test_day

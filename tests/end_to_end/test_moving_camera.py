@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from bricktrack_common.errors import ConfigError, RunFormatError
 from bricktrack_common.run_folder import read_run
-from bricktrack_host.assemblies.combined_test import read_test
+from bricktrack_host.assemblies.combined_summary import read_test
 from bricktrack_host.cli.main import app
 from bricktrack_host.fusion.pose_by_pose.moving_camera import NOT_OBSERVABLE
 from bricktrack_host.quality import PoseFlag

@@ -13,7 +13,7 @@ from light_fleet import LightFleet, write_fleet_file
 from typer.testing import CliRunner
 
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
-from bricktrack_host.assemblies.combined_test import read_test
+from bricktrack_host.assemblies.combined_summary import read_test
 from bricktrack_host.cli import test_day
 from bricktrack_host.cli._console import err, out
 from bricktrack_host.cli.main import app

@@ -123,7 +123,7 @@ def component_histories(table: "pa.Table") -> dict[str, MotionHistory]:
     Parameters
     ----------
     table : pyarrow.Table
-        As `bricktrack_host.assemblies.combined_test.read_components` gives it.
+        As `bricktrack_host.assemblies.combined_summary.read_components` gives it.
     """
     component = np.array(table.column("component").to_pylist(), dtype=object)
     whole = {

@@ -14,7 +14,7 @@ from bricktrack_host.cli._units import FleetOption, JsonOption, fleet_path
 from bricktrack_host.transfer.fleet_config import load_fleet
 
 if TYPE_CHECKING:
-    from bricktrack_host.assemblies.combined_test import TestSummary
+    from bricktrack_host.assemblies.combined_summary import TestSummary
 
 
 def combine(

@@ -49,7 +49,7 @@ def add(
 
         bricktrack dataset add campaign runs/b2_9f31c2_0007_shake --test shake-7
     """
-    from bricktrack_host.assemblies.combined_test import TEST_SUMMARY_NAME
+    from bricktrack_host.assemblies.combined_summary import TEST_SUMMARY_NAME
     from bricktrack_host.datasets.campaign_dataset import add_units
     from bricktrack_host.datasets.test_sources import source_of_run, sources_of_test
 

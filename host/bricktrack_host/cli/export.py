@@ -66,7 +66,7 @@ def export(
     """
     import pyarrow.compute
 
-    from bricktrack_host.assemblies.combined_test import TEST_SUMMARY_NAME, read_components, read_test
+    from bricktrack_host.assemblies.combined_summary import TEST_SUMMARY_NAME, read_components, read_test
     from bricktrack_host.results.daq_table import join_samples, read_daq_csv
     from bricktrack_host.results.export import read_run_table, write_table
     from bricktrack_host.results.result_store import results_of

@@ -42,7 +42,7 @@ def report(
 
         bricktrack report runs/sample_motion --truth tests/data/path-traced/truth
     """
-    from bricktrack_host.assemblies.combined_test import TEST_SUMMARY_NAME
+    from bricktrack_host.assemblies.combined_summary import TEST_SUMMARY_NAME
 
     if (source / TEST_SUMMARY_NAME).is_file():
         if truth is not None:
@@ -56,7 +56,7 @@ def report(
 
 
 def _report_test(folder: Path, output: Path | None, *, interactive: bool) -> Path:
-    from bricktrack_host.assemblies.combined_test import read_test
+    from bricktrack_host.assemblies.combined_summary import read_test
     from bricktrack_host.cli.combine import say_test
     from bricktrack_host.reporting.combined_report import write_combined_report
 

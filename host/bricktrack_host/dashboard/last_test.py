@@ -6,7 +6,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from bricktrack_common.errors import BricktrackError
-from bricktrack_host.assemblies.combined_test import (
+from bricktrack_host.assemblies.combined_summary import (
     TEST_SUMMARY_NAME,
     AssemblyEntry,
     TestSummary,

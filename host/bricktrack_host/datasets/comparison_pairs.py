@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bricktrack_common.errors import ConfigError, RunFormatError
-from bricktrack_host.assemblies.combined_test import (
+from bricktrack_host.assemblies.combined_summary import (
     TEST_SUMMARY_NAME,
     earlier_tests,
     read_components,

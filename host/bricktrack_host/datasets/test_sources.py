@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.compute
 
 from bricktrack_common.errors import ConfigError, RunFormatError
-from bricktrack_host.assemblies.combined_test import AssemblyEntry, UnitEntry, read_components, read_test
+from bricktrack_host.assemblies.combined_summary import AssemblyEntry, UnitEntry, read_components, read_test
 from bricktrack_host.datasets.motion_rows import ComponentRows, UnitSource
 from bricktrack_host.results.result_store import read_provenance, read_result, results_of
 

@@ -6,7 +6,7 @@ import numpy as np
 from bokeh.models import GlyphRenderer, GridPlot
 from bokeh.plotting import figure
 
-from bricktrack_host.assemblies.combined_test import AssemblyEntry
+from bricktrack_host.assemblies.combined_summary import AssemblyEntry
 from bricktrack_host.assemblies.motion_history import MotionHistory
 from bricktrack_host.reporting.combined_charts import NAMES, dropout_spans, impact_instants, lab_time
 from bricktrack_host.reporting.combined_report import (

@@ -7,7 +7,7 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from bricktrack_host.assemblies.combined_test import (
+from bricktrack_host.assemblies.combined_summary import (
     AssemblyEntry,
     TestSummary,
     UnitEntry,

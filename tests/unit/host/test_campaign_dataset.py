@@ -19,7 +19,8 @@ from small_lab import BRICK, UNITS, invented_run
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import ConfigError, RunFormatError, StorageError
-from bricktrack_host.assemblies.combined_test import combine_test, read_components
+from bricktrack_host.assemblies.combined_summary import read_components
+from bricktrack_host.assemblies.combined_test import combine_test
 from bricktrack_host.cli.main import app
 from bricktrack_host.datasets import campaign_dataset, campaign_folder
 from bricktrack_host.datasets.campaign_dataset import add_units, list_units, open_dataset

@@ -9,7 +9,8 @@ import pytest
 from small_lab import BRICK, UNITS, example, invented_run
 
 from bricktrack_common.errors import RunFormatError, StorageError
-from bricktrack_host.assemblies.combined_test import combine_test, read_components, read_test
+from bricktrack_host.assemblies.combined_summary import read_components, read_test
+from bricktrack_host.assemblies.combined_test import combine_test
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting.combined_charts import dropout_spans, impact_instants, spans
 from bricktrack_host.reporting.combined_report import (

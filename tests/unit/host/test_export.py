@@ -11,7 +11,8 @@ from small_lab import FLEET, UNITS, invented_run
 from typer.testing import CliRunner
 
 from bricktrack_common.errors import RunFormatError
-from bricktrack_host.assemblies.combined_test import combine_test, read_components, read_test
+from bricktrack_host.assemblies.combined_summary import read_components, read_test
+from bricktrack_host.assemblies.combined_test import combine_test
 from bricktrack_host.cli.main import app
 from bricktrack_host.results.daq_table import join_samples, read_daq_csv
 from bricktrack_host.results.export import read_run_table, write_table
