@@ -323,7 +323,7 @@ def run_case(case: Case, *, with_gtsam: bool = False) -> tuple[dict[str, Score],
     turn = normalised_squares(errors[:, :3], result.track.covariance[:, :3, :3])
     drawn = draw_pose_errors(
         smoothed, case.t_out_ns, n_draws=N_DRAWS, rng=np.random.default_rng(0),
-        common=common_part(smoothed.run.cov_seen, smoothed.scale, settings.optical_common_share),
+        common=common_part(smoothed.run, smoothed.scale, settings.optical_common_share),
     )  # fmt: skip
     band = MeanBand.of(normalised_squares(*drawn))
     facts = {

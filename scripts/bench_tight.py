@@ -131,7 +131,7 @@ def honesty_of(seed: int) -> dict[str, Honesty]:
     since = run.world.since_first_edge_s(t_ns)
     is_dropout = np.any([(since > a) & (since < a + d) for a, d in DROPOUTS], axis=0)
     is_impact = (tight.fused.track.flags & int(PoseFlag.IMPACT)) != 0
-    common = common_part(first.run.cov_seen, first.scale, settings.optical_common_share)
+    common = common_part(first.run, first.scale, settings.optical_common_share)
     out = {}
     for name, found, states, shared in (
         ("poses", tight.pose_level.track, first, common),

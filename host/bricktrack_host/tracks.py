@@ -54,6 +54,8 @@ class OpticalTrack:
         Seen less predicted, NaN where the LED was not used.
     led_t_ns : ndarray of int64, shape (n, n_leds)
         Mid-exposure of the row that each LED was seen in.
+    shared_covariance : ndarray, shape (n, 6, 6), optional
+        What of the covariance is of errors that stand still: neighbouring frames share them.
     """
 
     t_ns: IntArray
@@ -63,6 +65,7 @@ class OpticalTrack:
     flags: IntArray
     residual_px: FloatArray
     led_t_ns: IntArray
+    shared_covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

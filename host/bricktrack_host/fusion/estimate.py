@@ -293,7 +293,7 @@ def fused_result(
         return sample_motion(
             s.run, s.nodes, s.problem, estimate, s.b,
             output_t_ns=t_ns, seen_cam_s=s.run.t_cam_s[s.used],
-            common=common_part(s.run.cov_seen, s.scale, settings.optical_common_share),
+            common=common_part(s.run, s.scale, settings.optical_common_share),
             settings=settings, is_smoothed=is_smoothed,
         )  # fmt: skip
 

@@ -55,7 +55,8 @@ class FusionSettings:
         second order half the delay squared, 3e-6 at the BNO055's 62.5 Hz. None is expected.
     optical_common_share : float
         Part of the optical sd that neighbouring frames have in common (LED profile, calibration, pixel grid)
-        and that no averaging over frames takes away. It is added to the covariance that is given out.
+        and that no averaging over frames takes away, where poses do not say it themselves. It is added to the
+        covariance that is given out.
     gate_chi2 : float
         A frame whose residual to all the others, squared over its covariance, exceeds this is left out
         (6 degrees of freedom; 33 is passed by all but one in 100 000).

@@ -17,6 +17,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors
 from bricktrack_host.tracking.pictures.light_kernel import FLOOR_SD_PX
+from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import LedObservations
 
 logger = logging.getLogger(__name__)
@@ -25,6 +26,7 @@ _PRIOR_DOF = 1.0
 """What the floor, of another camera, counts for beside the residuals' own degrees of freedom."""
 _CLIP_SIGMAS = 3.0
 _CLIPPED_VARIANCE = 0.9733  # of a normal variable within three sigmas of its mean
+_MOST_STANDING = 0.9  # of a centroid's variance: the noise of its pixels is new in every picture
 _SD_GRID_PX = np.geomspace(0.002, 2.0, 140)
 
 
@@ -90,6 +92,27 @@ def measure_noise(errors: FrameErrors, leds: BoolArray | None = None) -> Centroi
     total = _PRIOR_DOF + dof
     mean = (_PRIOR_DOF * FLOOR_SD_PX**2 + dof * variance) / max(total - 2.0, 1.0)
     return CentroidNoise(float(np.sqrt(mean)), float(np.sqrt(variance)), float(dof), int(enough.size))
+
+
+def standing_share(residual_px: FloatArray) -> float:
+    """Return which share of the variance of a run's centroids stands still over it, 0 to 0.9.
+
+    Parameters
+    ----------
+    residual_px : ndarray, shape (n, n_leds, 2), px
+        Seen less predicted by the poses; NaN where an LED was not used.
+
+    Notes
+    -----
+    What no pose explains of the mean picture is a handful of numbers, and may be small by chance: the share
+    is the mean of the inverse chi-square that they give.
+    """
+    leds = all_finite(residual_px)
+    enough = leds.sum(axis=1) >= MIN_LEDS
+    if not enough.any():
+        return _MOST_STANDING
+    dof = 2 * float(np.median(leds[enough].sum(axis=1))) - 6
+    return min(_MOST_STANDING, dof / (dof - 2) / _independent(residual_px[enough]))
 
 
 def _free_residuals(

@@ -16,6 +16,7 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.tracking.centroid_noise import standing_share
 from bricktrack_host.tracking.identity.led_identity import SegmentMethod
 from bricktrack_host.tracking.led_fit import OF_THE_SAME_RUN
 from bricktrack_host.tracking.led_model.led_profile import collar_of
@@ -135,18 +136,22 @@ def solve_poses(
     else:
         poses = fit(uv, R, t_mm, motion)
     flags[torn] |= PoseFlag.IMPACT
-    return _finish(
+    misfit = _misfit(poses, uv)[:, None, None]
+    track = _finish(
         observations,
         t_ns,
         led_t_ns,
         poses.R_camera_brick,
         poses.t_camera_brick_mm,
-        poses.covariance * _misfit(poses, uv)[:, None, None],
+        poses.covariance * misfit,
         poses.residual_px,
         flags,
         all_finite(uv),
         brick_model,
     )
+    of_leds = standing_share(track.residual_px) * misfit * poses.by_centroids
+    of_profile = poses.by_profile[:, :, None] * poses.by_profile[:, None, :]
+    return replace(track, shared_covariance=of_leds + of_profile)
 
 
 def start_poses(

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from led_scenes import random_poses, seven_leds
 from pinhole import PinholeCamera
+from scipy.spatial.transform import Rotation
 
 from bricktrack_common.brick_model import ProfileEntry
-from bricktrack_host.tracking.centroid_noise import measure_noise, with_measured_noise
+from bricktrack_host.normalised_errors import normalised_squares
+from bricktrack_host.tracking.centroid_noise import measure_noise, standing_share, with_measured_noise
 from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
@@ -95,3 +97,38 @@ def test_poses_with_the_measured_noise_are_as_good_as_they_say():
     # Chi-square with 450 degrees of freedom scatters by 7 %; the floor alone is nine times too wide.
     assert shift_of[0] < 0.2
     assert shift_of[1] == pytest.approx(1.0, abs=0.25)
+
+
+def test_the_share_that_stands_still_is_told_from_residuals():
+    rng = np.random.default_rng(8)
+    shares = [
+        standing_share(rng.normal(0, 0.03, (7, 2)) + rng.normal(0, 0.04, (200, 7, 2))) for _ in range(300)
+    ]
+    # 0.36 by its truth; of 14 means less the 6 that a pose takes the share is widened by 8 / 6.
+    assert np.mean(shares) == pytest.approx(0.36 * 8 / 6, rel=0.1)
+    assert standing_share(rng.normal(0, 0.04, (200, 7, 2))) < 0.02
+    assert standing_share(np.full((5, 7, 2), np.nan)) == 0.9  # what nobody saw may be anything
+
+
+def test_what_frames_share_of_their_errors_is_as_large_as_it_is_said_to_be():
+    # 60 runs of 30 frames of one place: the mean error of a run is what its frames share.
+    n, sd_px = 30, 0.05
+    R0, t0 = random_poses(60, seed=11)
+    shared, new = [], []
+    for k in range(60):
+        rng = np.random.default_rng(k)
+        error = rng.normal(0, sd_px, (7, 2)) + rng.normal(0, sd_px, (n, 7, 2))
+        R, t = np.repeat(R0[k : k + 1], n, axis=0), np.repeat(t0[k : k + 1], n, axis=0)
+        observed = seen(R, t, error)
+        observed.cov_px2[:] = 2 * sd_px**2 * np.eye(2)
+        track = solve_poses(observed, CAMERA, BRICK, rolling_shutter=False)
+        turn = Rotation.from_matrix(np.swapaxes(track.R_camera_brick, 1, 2) @ R).as_rotvec()
+        e = np.concatenate([turn, t - track.t_camera_brick_mm], axis=1)
+        part = track.shared_covariance
+        shared.append(normalised_squares(e.mean(axis=0)[None], part[:1] + (track.covariance - part)[:1] / n))
+        new.append(normalised_squares(e - e.mean(axis=0), (track.covariance - part) * (1 - 1 / n)))
+    # F of 6 and 8 degrees of freedom, by 6 / 8: one run scatters by one, 60 by 0.13.
+    assert 0.6 < np.mean(shared) / 6 < 1.5
+    # What is new is what is left: a share of half is widened by 8 / 6, which leaves 0.33 for 0.5. The fusion
+    # finds as much from how the frames scatter.
+    assert 1.0 < np.mean(new) / 6 < 1.8

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from daemon_runs import simulate_run
 
+from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD
 from bricktrack_host.fusion.estimate import FusionInput, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.pose_by_pose.fused_output import common_part, sample_motion
@@ -21,7 +22,7 @@ def smoothed():
     run = simulate_run(41, duration_s=3.0)
     optical = solve_poses(run.observations, run.camera, run.brick)
     item = FusionInput(optical, run.imu, run.lever_arm_mm, optical.t_ns[5:-5])
-    return smooth_poses([prepare_run(item, SETTINGS)], SETTINGS)[0], optical.t_ns[5:-5]
+    return smooth_poses([prepare_run(item, SETTINGS)], SETTINGS)[0], optical.t_ns[5:-5], optical
 
 
 def sampled(smoothed, t_ns, estimate):
@@ -33,7 +34,7 @@ def sampled(smoothed, t_ns, estimate):
 
 
 def test_instants_give_the_same_alone_and_together_in_any_order(smoothed):
-    s, t_ns = smoothed
+    s, t_ns, _ = smoothed
     together = sampled(s, np.tile(t_ns[::-1], 2), s.estimate)
     assert np.isfinite(together.t_camera_brick_mm).all()
     for i in (0, 20, len(t_ns) + 3):
@@ -44,7 +45,7 @@ def test_instants_give_the_same_alone_and_together_in_any_order(smoothed):
 
 @pytest.mark.parametrize("wrong", ["negative", "nan", "more than wholly correlated"])
 def test_a_pose_whose_covariance_is_none_is_no_pose(smoothed, wrong):
-    s, t_ns = smoothed
+    s, t_ns, _ = smoothed
     covariance = s.estimate.covariance.copy()
     at = slice(len(s.nodes.t_s) // 3, len(s.nodes.t_s) // 3 + 30)
     of = covariance[at, s.b]
@@ -61,7 +62,7 @@ def test_a_pose_whose_covariance_is_none_is_no_pose(smoothed, wrong):
     assert (diagonal > 0).all()
 
 
-def test_what_frames_share_is_a_covariance_however_they_differ():
+def test_what_frames_share_is_a_covariance_however_they_differ(smoothed):
     # Frames of three kinds: the medians of their elements are no covariance.
     together = np.repeat([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, -1.0]], 20, axis=0)
     sd = np.repeat([1e-3, 1e-2], 3)
@@ -69,5 +70,18 @@ def test_what_frames_share_is_a_covariance_however_they_differ():
     covariances[:, :3, :3] = 0.1 * np.eye(3) + 0.9 * together[:, :, None] * together[:, None, :]
     covariances *= np.outer(sd, sd)
     assert np.linalg.eigvalsh(np.median(covariances, axis=0) / np.outer(sd, sd))[0] < -0.5
-    common = common_part(covariances, np.array([0.5, 0.5]), share=0.3)
+    run = replace(smoothed[0].run, cov_seen=covariances, shared_seen=None)
+    common = common_part(run, np.array([0.5, 0.5]), share=0.3)
     assert np.linalg.eigvalsh(common / np.outer(sd, sd))[0] > 0
+
+
+def test_what_poses_say_that_they_share_is_taken_out_of_each_and_put_back_once(smoothed):
+    run = smoothed[0].run
+    optical = smoothed[2]
+    to_mm = np.repeat([1.0, 1e3], 3)
+    whole = (run.cov_seen + run.shared_seen) * to_mm[:, None] * to_mm
+    floor = np.diag(np.repeat([MIN_ROTATION_SD_RAD**2, 4e-6], 3))  # 2 um
+    assert whole == pytest.approx(optical.covariance[run.frame] + floor, rel=1e-9, abs=1e-15)
+    assert (np.linalg.eigvalsh(run.cov_seen)[:, 0] > 0).all()
+    common = common_part(run, np.ones(2), share=0.3)
+    assert (np.abs(run.shared_seen - common).max(axis=(1, 2)) == 0).any()

@@ -7,6 +7,7 @@ from pinhole import PinholeCamera
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import TrackingError
+from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.pose.prsoi import prsoi_starts
 from bricktrack_host.tracking.pose.refine import LedMotion, refine_poses
 
@@ -211,3 +212,26 @@ def test_a_brick_that_turns_back_within_the_frame_is_within_its_covariance():
     error = error_of(poses.R_camera_brick, poses.t_camera_brick_mm, R, t)
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariance), error)
     assert nees.max() < 16.8  # the 1 % point of chi-square with 6
+
+
+def test_a_profile_that_is_off_moves_the_pose_as_is_said():
+    brick = seven_leds(collar_mm=0.7)
+    R, t = random_poses(20, seed=5)
+    prediction, _ = predict_brick(R, t, CAMERA, brick, collar_mm=0.7)
+    fits = [
+        refine_poses(
+            prediction.uv_px + c * prediction.model_shift_px, cov(20), R, t, CAMERA, brick, collar_mm=0.7
+        )
+        for c in (-1.0, 0.0, 1.0)
+    ]
+    off = error_of(
+        fits[0].R_camera_brick, fits[0].t_camera_brick_mm, fits[2].R_camera_brick, fits[2].t_camera_brick_mm
+    )
+    sd = np.sqrt(np.diagonal(fits[1].covariance, axis1=1, axis2=2))
+    assert (np.abs(off / 2 + fits[1].by_profile) < 0.05 * sd).all()
+    assert np.abs(fits[1].by_profile / sd).max() > 0.2
+    rest = fits[1].covariance - fits[1].by_centroids
+    by_profile = fits[1].by_profile[:, :, None] * fits[1].by_profile[:, None]
+    assert rest == pytest.approx(
+        by_profile, abs=1e-12
+    )  # no twist: what is not the centroids' is the profile's

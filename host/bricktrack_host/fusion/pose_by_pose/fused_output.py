@@ -197,26 +197,27 @@ def _misses(
     return turn[of], (after_x[:, VEL] - v)[of], (after_x[:, POS] - p)[of]
 
 
-def common_part(cov_seen: FloatArray, scale: FloatArray, share: float) -> FloatArray:
-    """Return the covariance of errors that the frames have in common; the median frame stands for all.
+def common_part(run: Run, scale: FloatArray, share: float) -> FloatArray:
+    """Return the covariance of errors that a run's frames have in common, (6, 6); one frame stands for all.
 
-    At least the share that is stated; more where the frames agree with each other better than their
-    covariance allows, for then it holds what they share.
+    As the poses say. Where they do not, at least the share that is stated; more where the frames agree with
+    each other better than their covariance allows, for then it holds what they share.
 
     Parameters
     ----------
-    cov_seen : ndarray, shape (n_frames, 6, 6)
-        As stated.
+    run : Run
     scale : ndarray, shape (2,)
         Of the stated sd of rotation and position.
     share : float
         Of the stated sd that is in common in any case.
     """
-    share_at = np.repeat(np.sqrt(np.maximum((share * scale) ** 2, 1.0 - scale**2)), 3)
     # A frame's own matrix: medians of single elements would be no covariance.
-    size = np.log(np.diagonal(cov_seen, axis1=1, axis2=2)).sum(axis=1)
-    median = cov_seen[np.argsort(size)[len(size) // 2]]
-    return np.asarray(share_at[:, None] * median * share_at)
+    size = np.log(np.diagonal(run.cov_seen, axis1=1, axis2=2)).sum(axis=1)
+    median = np.argsort(size)[len(size) // 2]
+    if run.shared_seen is not None:
+        return np.asarray(run.shared_seen[median])
+    share_at = np.repeat(np.sqrt(np.maximum((share * scale) ** 2, 1.0 - scale**2)), 3)
+    return np.asarray(share_at[:, None] * run.cov_seen[median] * share_at)
 
 
 def unsure_times(

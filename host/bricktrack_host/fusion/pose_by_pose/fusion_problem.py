@@ -51,6 +51,10 @@ class Run:
         Frames with a pose, camera time.
     frame : ndarray of int64, shape (n,)
         Their index in the optical track.
+    cov_seen : ndarray, shape (n, 6, 6)
+        Of what is new in each frame.
+    shared_seen : ndarray, shape (n, 6, 6), or None
+        Of what frames share, where that is known; else ``cov_seen`` is of both.
     camera : CameraMotion or None
         Where the camera moves: poses are then in still axes about its IMU, and gravity is its accelerometer's
         bias.
@@ -74,6 +78,7 @@ class Run:
     cov_seen: FloatArray
     t_mid_s: float
     span_cam_s: tuple[float, float]
+    shared_seen: FloatArray | None = None
     camera: CameraMotion | None = None
     still_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     gyro_gain: FloatArray = field(default_factory=lambda: np.eye(3))
@@ -107,9 +112,10 @@ class Run:
             t_s = imu_seconds(alignment, optical.t_ns, signal.epoch_ns)
             optical, still_s = still_track(optical, camera, t_s), t_s[seen]
         t_cam_s = seconds_since(optical.t_ns[seen], signal.epoch_ns)
-        cov = optical.covariance[seen].copy()
-        cov[:, 3:] *= 1e-3
-        cov[:, :, 3:] *= 1e-3
+        shared = optical.shared_covariance
+        to_m = np.repeat([1.0, 1e-3], 3)
+        cov = optical.covariance[seen] - (0.0 if shared is None else shared[seen])
+        cov = to_m[:, None] * cov * to_m
         floor = np.repeat([MIN_ROTATION_SD_RAD**2, _MIN_POSITION_SD_M**2], 3)
         cov = 0.5 * (cov + np.swapaxes(cov, 1, 2)) + np.diag(floor)
         # IMU samples in camera time, as far as they reach beyond the frames.
@@ -131,6 +137,7 @@ class Run:
             R_seen=optical.R_camera_brick[seen],
             p_seen_m=optical.t_camera_brick_mm[seen] * 1e-3,
             cov_seen=cov,
+            shared_seen=None if shared is None else to_m[:, None] * shared[seen] * to_m,
             t_mid_s=(alignment.t_mid_ns - signal.epoch_ns) * 1e-9,
             span_cam_s=span,
             camera=camera,

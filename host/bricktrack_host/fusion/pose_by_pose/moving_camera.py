@@ -204,11 +204,13 @@ def still_track(optical: OpticalTrack, motion: CameraMotion, t_s: FloatArray) ->
     turn = np.zeros((len(t_s), 6, 6))
     turn[:, :3, :3], turn[:, 3:, 3:] = np.eye(3), motion.still_attitude(t_s)
     R, p_m = motion.to_still(t_s, optical.R_camera_brick, 1e-3 * optical.t_camera_brick_mm)
+    shared = optical.shared_covariance
     return replace(
         optical,
         R_camera_brick=R,
         t_camera_brick_mm=1e3 * p_m,
         covariance=turn @ optical.covariance @ np.swapaxes(turn, 1, 2),
+        shared_covariance=None if shared is None else turn @ shared @ np.swapaxes(turn, 1, 2),
     )
 
 

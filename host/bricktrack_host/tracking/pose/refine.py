@@ -18,8 +18,18 @@ from bricktrack_host.tracking.led_model.hit_polynomials import hit_polynomials
 from bricktrack_host.tracking.led_model.led_outline import outlines_of
 from bricktrack_host.tracking.led_model.led_profile import shift_per_radius
 from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.refine_equations import RATE_PER_TWIST
 from bricktrack_host.tracking.pose.refine_kernel import fit_frames
-from bricktrack_host.tracking.pose.refine_problem import N_MORE, Fitted, Model, Observed, room_for
+from bricktrack_host.tracking.pose.refine_problem import (
+    N_MORE,
+    N_UNKNOWNS,
+    PROFILE,
+    TWIST,
+    Fitted,
+    Model,
+    Observed,
+    room_for,
+)
 
 HUBER_SIGMAS = 2.5
 """Length of a whitened 2-D residual beyond which its pull grows no more; 4 % of normal ones are longer."""
@@ -68,6 +78,10 @@ class RefinedPoses:
     t_camera_brick_mm : ndarray, shape (n, 3), mm
     covariance : ndarray, shape (n, 6, 6)
         Of ``[dtheta rad, dt mm]``, `bricktrack_host.tracks`.
+    by_centroids : ndarray, shape (n, 6, 6)
+        What of it is by the errors of single LEDs' centroids; the rest is by profile and twist.
+    by_profile : ndarray, shape (n, 6)
+        Change of the pose by one standard deviation of what the profile leaves unknown in all LEDs alike.
     residual_px : ndarray, shape (n, n_leds, 2), px
         Seen less predicted, for every seen LED, also those weighted down.
     sigmas : ndarray, shape (n, n_leds)
@@ -84,6 +98,8 @@ class RefinedPoses:
     R_camera_brick: FloatArray
     t_camera_brick_mm: FloatArray
     covariance: FloatArray
+    by_centroids: FloatArray
+    by_profile: FloatArray
     residual_px: FloatArray
     sigmas: FloatArray
     is_outlier: BoolArray
@@ -176,7 +192,9 @@ def refine_poses(
     return RefinedPoses(
         R_camera_brick=out.R,
         t_camera_brick_mm=out.t,
-        covariance=out.covariance,
+        covariance=out.covariance[:, :6].copy(),
+        by_centroids=_by_centroids(out.covariance, motion),
+        by_profile=out.covariance[:, PROFILE].copy(),
         residual_px=out.residual,
         sigmas=out.sigmas,
         is_outlier=is_outlier,
@@ -185,6 +203,21 @@ def refine_poses(
         area_px2=out.area,
         facing=out.facing,
     )
+
+
+def _by_centroids(with_pose: FloatArray, motion: LedMotion | None) -> FloatArray:
+    """Return what centroids' own errors make of the covariance: what the unknowns' priors do not, (n, 6, 6).
+
+    With N the normal matrix and D the inverse covariance of the priors, ``N^-1 = N^-1 (N - D) N^-1 +
+    N^-1 D N^-1``: the former is of the centroids.
+    """
+    at_profile = with_pose[:, PROFILE]
+    out = with_pose[:, :6] - at_profile[:, :, None] * at_profile[:, None, :]
+    if motion is not None and motion.twist_sd is not None:
+        sd = np.concatenate([motion.twist_sd, RATE_PER_TWIST * motion.twist_sd], axis=1)
+        by_twist = with_pose[:, TWIST:] / sd[:, :, None]
+        out -= np.swapaxes(by_twist, 1, 2) @ by_twist
+    return np.asarray(out)
 
 
 def _model(
@@ -238,7 +271,7 @@ def _started(R: FloatArray, t_mm: FloatArray, n_leds: int) -> Fitted:
         R=np.array(R, dtype=np.float64, order="C"),
         t=np.array(t_mm, dtype=np.float64, order="C"),
         more=np.zeros((n, N_MORE)),
-        covariance=np.empty((n, 6, 6)),
+        covariance=np.zeros((n, N_UNKNOWNS, 6)),
         residual=np.full((n, n_leds, 2), np.nan),
         sigmas=np.full((n, n_leds), np.nan),
         cost=np.zeros(n),

@@ -20,7 +20,7 @@ from bricktrack_host.tracking.pose.refine_problem import (
 )
 from bricktrack_host.tracking.pose.small_algebra import rotation
 
-_RATE_PER_TWIST = 30.0
+RATE_PER_TWIST = 30.0
 """How wrong the twist's rate may be for a given doubt about the twist, 1/s. Of a sine of w T = 0.6 to pi (3
 to 15 Hz at 30 frames a second), a cubic spline's second derivative at the frames errs by 0.09 to 0.15 of the
 fourth difference over T^2, while the twist is doubted by 0.1 of it over T (`optical_track`)."""
@@ -183,7 +183,7 @@ def normal_equations(
         A[PROFILE, PROFILE] = 1.0  # held where it is
     if has_twist:
         for c in range(12):
-            sd = observed.twist_sd[i, c % 6] * (_RATE_PER_TWIST if c >= 6 else 1.0)
+            sd = observed.twist_sd[i, c % 6] * (RATE_PER_TWIST if c >= 6 else 1.0)
             A[TWIST + c, TWIST + c] += 1 / sd**2
             g[TWIST + c] -= more[1 + c] / sd**2
     return cost + _prior_cost(i, observed, model, more)
@@ -201,7 +201,7 @@ def _prior_cost(i: int, observed: Observed, model: Model, more: FloatArray) -> f
     if observed.has_twist:
         twist_sd = observed.twist_sd
         for c in range(12):
-            cost += (more[1 + c] / (twist_sd[i, c % 6] * (_RATE_PER_TWIST if c >= 6 else 1.0))) ** 2
+            cost += (more[1 + c] / (twist_sd[i, c % 6] * (RATE_PER_TWIST if c >= 6 else 1.0))) ** 2
     return cost
 
 

@@ -21,7 +21,7 @@ from bricktrack_host.tracking.pose.refine_problem import (
     Observed,
     Room,
 )
-from bricktrack_host.tracking.pose.small_algebra import inverse_block, quadratic, rotation, solve
+from bricktrack_host.tracking.pose.small_algebra import inverse_columns, quadratic, rotation, solve
 
 _FRESH_MM, _FRESH_RAD = 1.0, 0.03  # moved less than this, an LED's shape is good to a few 0.001 px
 _LAST_SIGMAS = 0.3
@@ -84,7 +84,7 @@ def _fit_frame(i: int, observed: Observed, model: Model, fitted: Fitted, max_ste
     if not math.isfinite(cost) or not solve(room.A, room.g, 0.0, n, room.L, room.step):
         fitted.cost[i] = np.nan
         return
-    inverse_block(room.L, n, fitted.covariance[i], room.step)
+    inverse_columns(room.L, n, fitted.covariance[i], room.step)
 
 
 @compiled_inline

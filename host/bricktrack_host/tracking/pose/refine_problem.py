@@ -59,7 +59,10 @@ class Model(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Results, in place: poses (n, 3, 3) and (n, 3), the rest of the unknowns, and what `refine` reports."""
+    """Results, in place: poses (n, 3, 3) and (n, 3), the rest of the unknowns, and what `refine` reports.
+
+    ``covariance``, (n, N_UNKNOWNS, 6), is of all unknowns with the pose.
+    """
 
     R: FloatArray
     t: FloatArray

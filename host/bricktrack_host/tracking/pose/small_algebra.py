@@ -72,8 +72,8 @@ def quadratic(A: FloatArray, x: FloatArray, n: int) -> float:
 
 
 @compiled_fast
-def inverse_block(L: FloatArray, n: int, out: FloatArray, column: FloatArray) -> None:
-    """Put the first (6, 6) block of the inverse of L L', (n, n), into ``out``, L as from `solve`.
+def inverse_columns(L: FloatArray, n: int, out: FloatArray, column: FloatArray) -> None:
+    """Put the first six columns of the inverse of L L', (n, n), into ``out``, L as from `solve`.
 
     ``column`` has room for n.
     """
@@ -88,5 +88,5 @@ def inverse_block(L: FloatArray, n: int, out: FloatArray, column: FloatArray) ->
             for k in range(c + 1, n):
                 total -= L[k, c] * column[k]
             column[c] = total * L[c, c]
-        for c in range(6):
+        for c in range(n):
             out[c, j] = column[c]
