@@ -88,7 +88,7 @@ class TruthComparison:
         In camera axes with nothing zeroed.
     from_rest : list of GroupErrors
         The same instants as displacements from rest, x, y, z in brick axes at rest: constant errors are gone.
-        Empty where the run has no rest pose. Their normalised errors are NaN.
+        Empty where the run has no rest pose.
     series : dict
         `ErrorSeries` of ``"optical"`` and ``"fused"`` (at inertial slots, or frames if there are none).
     impacts_ns : ndarray of int64, shape (k,)
