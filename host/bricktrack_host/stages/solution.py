@@ -41,6 +41,7 @@ from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.copied_frames import with_copied_frames_left_out
 from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_fit import with_profile_of_run
+from bricktrack_host.tracking.led_sizes import words_on_sizes
 from bricktrack_host.tracking.odd_leds import with_odd_leds_doubted, words_on_odd_leds
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 from bricktrack_host.tracking.pose.finite import all_finite
@@ -98,6 +99,7 @@ def solve_run(
             observations, rays, brick, rolling_shutter=settings.rolling_shutter, first=first
         )
     _require_poses(optical, run, brick)
+    problems += words_on_sizes(observations, optical, rays, brick)
     with stages("align clocks"):
         edge_fit = fit_square_wave(run, problems)
         imu = choose_imu(run, brick, settings, problems)
