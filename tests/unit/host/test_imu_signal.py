@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import ImuFlag
+from bricktrack_host.fusion.inertial.imu_samples import clean_samples
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal, chain_rotations, roughness
 from bricktrack_host.tracks import ImuTrack
 
@@ -113,6 +114,22 @@ def test_clipped_peak_is_completed_and_marked():
     assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
     assert (signal.clip_sd_mps2[clipped] >= 1.0).all()
     assert (signal.clip_sd_mps2[np.abs(true[:, 0]) < 2] == 0).all()
+
+
+def test_a_sample_a_little_below_the_limit_was_clipped_if_those_around_it_say_so():
+    t = np.arange(300) / 100.0
+    # One peak clipped, its first and last sample rounded off by filters, and one that just stays below.
+    true = 14.0 * np.exp(-(((t - 1.0) / 0.05) ** 2)) + 9.95 * np.exp(-(((t - 2.0) / 0.2) ** 2))
+    measured = np.minimum(true, 10.0)
+    rounded = np.flatnonzero(measured == 10.0)[[0, -1]]
+    measured[rounded] = 9.9
+    acc = measured[:, None] * [1.0, 0.1, 0.1]
+    samples = clean_samples(track(t, np.zeros((300, 3)), acc, limit=10.0))
+    assert (samples.acc_mps2[rounded, 0] > 10.0).all() and (samples.clip_sd_mps2[rounded] > 0).all()
+    below = np.abs(t - 2.0) < 0.15
+    assert (measured[below] > 9.8).any()
+    assert (samples.acc_mps2[below, 0] == measured[below]).all()
+    assert (samples.clip_sd_mps2[below] == 0).all()
 
 
 def test_missing_samples_are_gaps_and_repeats_are_not_used():

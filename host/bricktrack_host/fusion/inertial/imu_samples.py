@@ -26,7 +26,8 @@ _PREDICTION_GAIN = comb(16, 8) ** 0.5 / comb(8, 4)
 _STEADY_SAMPLES = 25
 _IMPACT_SIGMA = 5.0
 _VIBRATION_MPS2 = 0.3  # of the median sample off its neighbours: a steady vibration, which can be predicted
-_CLIP_SHARE = 0.98  # of the range: filters inside the chip round a clipped peak off a little
+_CLIP_SHARE = 0.999  # of the range
+_NEARLY_CLIPPED = 0.98  # filters inside the chip round a short clipped peak off a little
 
 
 def seconds_since(t_ns: IntArray, epoch_ns: int) -> FloatArray:
@@ -86,17 +87,27 @@ def _usual(off: FloatArray) -> FloatArray:
 
 
 def _bridge_clipped(t_s: FloatArray, acc: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
-    """Return samples with clipped peaks completed by the cubic of the others, and how unsure they are."""
+    """Return samples with clipped peaks completed by the cubic of the others, and how unsure they are.
+
+    A sample a little below the limit was clipped only if those around it lead beyond the limit; else it is a
+    measurement like any other.
+    """
     done, sd = acc.copy(), np.zeros(len(acc))
     for axis in range(3):
-        clipped = np.abs(acc[:, axis]) >= _CLIP_SHARE * limit
-        if not clipped.any() or (~clipped).sum() < 4:
-            sd[clipped] = limit
+        size = np.abs(acc[:, axis])
+        near = np.flatnonzero(size >= _NEARLY_CLIPPED * limit)
+        if not near.size:
             continue
-        bridge = CubicSpline(t_s[~clipped], acc[~clipped, axis])(t_s[clipped])
-        sign = np.sign(acc[clipped, axis])
+        others = np.delete(np.arange(len(acc)), near)
+        if len(others) < 4:
+            sd[near] = limit
+            continue
+        sign = np.sign(acc[near, axis])
+        bridge = sign * CubicSpline(t_s[others], acc[others, axis])(t_s[near])
+        is_clipped = (size[near] >= _CLIP_SHARE * limit) | (bridge > limit)
+        clipped, sign, bridge = near[is_clipped], sign[is_clipped], bridge[is_clipped]
         # The truth lies beyond the limit; a cubic over a long clipped stretch can fly off, so it is bounded.
-        excess = np.clip(sign * bridge - limit, 0.0, limit)
+        excess = np.clip(bridge - limit, 0.0, limit)
         done[clipped, axis] = sign * (limit + excess)
         sd[clipped] = np.maximum(sd[clipped], 0.1 * limit + 0.5 * excess)
     return done, np.asarray(maximum_filter1d(sd, 3, mode="nearest"))
