@@ -42,7 +42,7 @@ from bricktrack_host.tracking.copied_frames import with_copied_frames_left_out
 from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_fit import with_profile_of_run
 from bricktrack_host.tracking.led_sizes import words_on_sizes
-from bricktrack_host.tracking.odd_leds import with_odd_leds_doubted, words_on_odd_leds
+from bricktrack_host.tracking.odd_leds import with_odd_leds_doubted, words_on_odd_leds, words_on_unused_leds
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import LedObservations, OpticalTrack
@@ -94,6 +94,7 @@ def solve_run(
         errors = frame_errors(observations, first, rays, brick, rolling_shutter=settings.rolling_shutter)
         observations, errors = with_odd_leds_doubted(observations, errors)
         problems += words_on_odd_leds(observations, brick)
+        problems += words_on_unused_leds(observations, brick)
         observations = with_measured_noise(observations, errors)
         optical = solve_poses(
             observations, rays, brick, rolling_shutter=settings.rolling_shutter, first=first

@@ -14,10 +14,18 @@ from bricktrack_common.brick_model import BrickModel
 from bricktrack_host.quality import LedFlag
 from bricktrack_host.tracking.centroid_noise import measure_noise
 from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors
+from bricktrack_host.tracking.led_tracker import NOT_USED
 from bricktrack_host.tracks import LedObservations
 
 _CHANCE = 1e-4
 _LEAST_PX = 0.15  # what a profile's or a ray's own error may be
+_IDLE_SHARE = 0.05  # of the frames; an LED hidden for most of a shake is of use in more
+_WHY_UNUSED = {
+    LedFlag.MISSING: "not found",
+    LedFlag.PARTLY_COVERED: "partly covered",
+    LedFlag.MERGED: "run together with another light",
+    LedFlag.BORDER: "cut by the picture's border",
+}
 
 
 def with_odd_leds_doubted(
@@ -56,6 +64,29 @@ def words_on_odd_leds(observations: LedObservations, brick_model: BrickModel) ->
     return [
         f"LED {names}: elsewhere than all the other LEDs say, in every frame alike, and doubted by as much. "
         "Check its place in the layout, and whether it is clean"
+    ]
+
+
+def words_on_unused_leds(observations: LedObservations, brick_model: BrickModel) -> list[str]:
+    """Return a line on LEDs that hardly any frame could use while it used others, if there are any."""
+    used = (observations.led_flags & int(NOT_USED)) == 0
+    used = used[used.any(axis=1)]
+    if not len(used):
+        return []
+    idle = np.flatnonzero(used.mean(axis=0) < _IDLE_SHARE)
+    if not idle.size:
+        return []
+    named = []
+    for k in idle:
+        flags = observations.led_flags[:, k]
+        why = [(int(((flags & int(flag)) != 0).sum()), words) for flag, words in _WHY_UNUSED.items()]
+        told = ", ".join(f"{words} in {n}" for n, words in sorted(why, reverse=True) if n)
+        named.append(
+            f"{brick_model.led_names[k]}, used in {int(used[:, k].sum())} of {len(used)} frames ({told})"
+        )
+    return [
+        f"LEDs that hardly served: {'; '.join(named)}. They are dark or faint beside the others, covered, or "
+        "not where the layout has them. The others hold the poses, less surely"
     ]
 
 

@@ -10,7 +10,12 @@ from bricktrack_host.quality import LedFlag
 from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_model.led_profile import predict_brick
-from bricktrack_host.tracking.odd_leds import odd_leds_px, with_odd_leds_doubted, words_on_odd_leds
+from bricktrack_host.tracking.odd_leds import (
+    odd_leds_px,
+    with_odd_leds_doubted,
+    words_on_odd_leds,
+    words_on_unused_leds,
+)
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 from bricktrack_host.tracking.pictures.light_kernel import FLOOR_SD_PX
 from bricktrack_host.tracks import LedObservations
@@ -94,3 +99,18 @@ def test_poses_are_freed_of_an_odd_led_and_say_so():
         track = solve_poses(told, CAMERA, BRICK, first=first, rolling_shutter=False)
         rms_mm.append(np.sqrt(np.mean((track.t_camera_brick_mm - t) ** 2)))
     assert rms_mm[1] < 0.3 * rms_mm[0]
+
+
+def test_an_led_that_hardly_served_is_named_with_the_reason():
+    R, t = shaken(4)
+    run = seen(R, t, off_px=0.0, seed=4)
+    assert words_on_unused_leds(run, BRICK) == []
+    flags = run.led_flags.copy()
+    flags[:, 2] = int(LedFlag.MISSING)
+    flags[:21, 4], flags[21:24, 4] = int(LedFlag.PARTLY_COVERED), int(LedFlag.MISSING)
+    flags[:20, 5] = int(LedFlag.MISSING)  # hidden for most of the run only
+    flags[24] = int(LedFlag.MISSING)  # a picture without any says nothing of single ones
+    (words,) = words_on_unused_leds(replace(run, led_flags=flags), BRICK)
+    assert "m2, used in 0 of 24 frames (not found in 25); m4, used in 0 of 24 frames" in words
+    assert "(partly covered in 21, not found in 4)" in words
+    assert "m5" not in words
