@@ -14,6 +14,8 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.rotations import angles_xyz_from_matrix
 from bricktrack_host.quality import LedFlag, PoseFlag, describe
 from bricktrack_host.results.result_store import RunResult
+from bricktrack_host.results.run_summary import main_track
+from bricktrack_host.tracks import FusedTrack
 
 Colour = tuple[int, int, int]  # blue, green, red
 Image = NDArray[np.uint8]
@@ -24,8 +26,7 @@ RESIDUAL: Colour = (255, 190, 90)
 INK: Colour = (240, 240, 240)
 FAINT: Colour = (150, 150, 150)
 AXES: tuple[Colour, Colour, Colour] = ((90, 130, 255), (110, 210, 110), (255, 170, 80))
-"""Of the camera's poses in the strip; the fused motion is of the same, darker."""
-_DARKER = 0.5
+"""Of the motion in the strip: a line where it is fused, dots for the camera's poses."""
 
 RESIDUAL_SCALE = 100.0
 """A residual of 0.1 px is drawn 10 px long."""
@@ -66,13 +67,17 @@ class OverlayArtist:
         seen = _from_rest(result, optical.R_camera_brick, optical.t_camera_brick_mm)
         fused = np.full((n, 6), np.nan)
         if track is not None and len(track.t_ns) == n:
-            fused = _from_rest(result, track.R_camera_brick, track.t_camera_brick_mm)
-            fused[track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) != 0] = np.nan
-        t_s = (optical.t_ns - (optical.t_ns[0] if result.t0_ns is None else result.t0_ns)) / 1e9
+            fused = _known_from_rest(result, track)
+        origin_ns = optical.t_ns[0] if result.t0_ns is None else result.t0_ns
+        t_s = (optical.t_ns - origin_ns) / 1e9
         first, stop = frames or (0, n)
+        dense = main_track(result)
+        line = (t_s, seen[:, :3])
+        if dense is not None:
+            line = ((dense.t_ns - origin_ns) / 1e9, _known_from_rest(result, dense)[:, :3])
         strip, cursor = _draw_strip(
-            t_s, seen[:, :3], fused[:, :3], width_px, span_s=(t_s[first], t_s[stop - 1]),
-            from_rest=result.rest is not None,
+            (t_s, seen[:, :3]), line, width_px, span_s=(t_s[first], t_s[stop - 1]),
+            from_rest=result.rest is not None, is_fused=dense is not None,
         )  # fmt: skip
         return cls(result, seen, fused, height_px, strip, cursor)
 
@@ -138,6 +143,13 @@ class OverlayArtist:
         return f"{place}   from {origin}"
 
 
+def _known_from_rest(result: RunResult, track: FusedTrack) -> FloatArray:
+    """Return fused motion as `_from_rest`, NaN where it is extrapolated or not known."""
+    moved = _from_rest(result, track.R_camera_brick, track.t_camera_brick_mm)
+    moved[track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) != 0] = np.nan
+    return moved
+
+
 def _from_rest(result: RunResult, R: FloatArray, t_mm: FloatArray) -> FloatArray:
     if result.rest is not None:
         relative = result.rest.relative(R, t_mm)
@@ -146,43 +158,57 @@ def _from_rest(result: RunResult, R: FloatArray, t_mm: FloatArray) -> FloatArray
 
 
 def _draw_strip(
-    t_s: FloatArray,
-    optical_mm: FloatArray,
-    fused_mm: FloatArray,
+    dots: tuple[FloatArray, FloatArray],
+    line: tuple[FloatArray, FloatArray],
     width_px: int,
     *,
     span_s: tuple[float, float],
     from_rest: bool,
+    is_fused: bool,
 ) -> tuple[Image, NDArray[np.int64]]:
-    """Return the histories of three displacements, fused and the camera's, and the column of each frame."""
+    """Return the histories of three displacements, and the column of each frame.
+
+    ``dots``, the camera's poses, and ``line``: seconds, shape (n,), and displacements, shape (n, 3), mm.
+    """
     strip = np.full((STRIP_ROWS, width_px, 3), 24, dtype=np.uint8)
     left, right, top, bottom = 90, width_px - 30, _WORDS_ROWS + 34, STRIP_ROWS - 30
-    shown = (t_s >= span_s[0]) & (t_s <= span_s[1])
-    share = (t_s - span_s[0]) / max(span_s[1] - span_s[0], 1e-9)
-    columns = np.rint(left + np.clip(share, 0, 1) * (right - left)).astype(np.int64)
-    middle_mm = np.zeros(3) if from_rest else np.nanmedian(np.vstack([optical_mm, fused_mm]), axis=0)
-    curves = [(curve - middle_mm)[shown] for curve in (fused_mm, optical_mm)]
-    known = np.abs(np.vstack(curves))
+
+    def columns_of(t_s: FloatArray) -> NDArray[np.int64]:
+        share = (t_s - span_s[0]) / max(span_s[1] - span_s[0], 1e-9)
+        return np.rint(left + np.clip(share, 0, 1) * (right - left)).astype(np.int64)
+
+    middle_mm = np.zeros(3) if from_rest else np.nanmedian(np.vstack([dots[1], line[1]]), axis=0)
+    curves = []
+    for t_s, mm in (line, dots):
+        shown = (t_s >= span_s[0]) & (t_s <= span_s[1])
+        curves.append((columns_of(t_s[shown]), (mm - middle_mm)[shown]))
+    known = np.abs(np.vstack([mm for _, mm in curves]))
     limit = float(np.nanmax(known)) if np.isfinite(known).any() else 1.0
     limit = max(limit, 1e-3) * 1.05
     cv2.line(strip, (left, (top + bottom) // 2), (right, (top + bottom) // 2), (70, 70, 70), 1)
-    for curve, shade in zip(curves, (_DARKER, 1.0), strict=True):
-        rows = (top + bottom) / 2 - curve / limit * (bottom - top) / 2
+    for draw, (columns, mm) in zip((_draw_curve, _draw_dots), curves, strict=True):
+        rows = (top + bottom) / 2 - mm / limit * (bottom - top) / 2
         for axis in range(3):
-            ink = tuple(round(shade * x) for x in AXES[axis])
-            _draw_curve(strip, columns[shown], rows[:, axis], ink)
+            draw(strip, columns, rows[:, axis], AXES[axis])
     for axis, letter in enumerate("xyz"):
         _write(strip, letter, (left + 30 * axis, top - 10), AXES[axis])
     what = "displacement from rest" if from_rest else "position less its median"
-    words = f"{what}, mm, from {span_s[0]:.2f} to {span_s[1]:.2f} s; darker: fused"
+    words = f"{what}, mm, from {span_s[0]:.2f} to {span_s[1]:.2f} s; "
+    words += "line: fused, dots: camera alone" if is_fused else "camera alone"
     _write(strip, words, (left + 100, top - 10), FAINT)
     _write(strip, f"arrows: residuals x {RESIDUAL_SCALE:g}", (width_px - 330, top - 10), RESIDUAL)
     for value, row in ((limit, top), (-limit, bottom)):
         _write(strip, f"{value:+.2g}", (8, row + 8), FAINT)
-    return strip, columns
+    return strip, columns_of(dots[0])
 
 
-def _draw_curve(strip: Image, columns: NDArray[np.int64], rows: FloatArray, ink: tuple[int, ...]) -> None:
+def _draw_dots(strip: Image, columns: NDArray[np.int64], rows: FloatArray, ink: Colour) -> None:
+    """Draw a dot at each place that is known."""
+    for i in np.flatnonzero(np.isfinite(rows)):
+        cv2.circle(strip, (int(columns[i]), round(float(rows[i]))), 3, ink, cv2.FILLED, cv2.LINE_AA)
+
+
+def _draw_curve(strip: Image, columns: NDArray[np.int64], rows: FloatArray, ink: Colour) -> None:
     """Draw a line through what is known."""
     known = np.isfinite(rows)
     for piece in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(known.astype(np.int8))) + 1):

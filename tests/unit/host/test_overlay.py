@@ -108,6 +108,16 @@ def test_the_strip_of_chosen_frames_spans_them_alone(result):
     assert min(rows.min(), len(plot) - 1 - rows.max()) < 12
 
 
+def test_the_line_goes_on_where_the_camera_saw_nothing(result, artist):
+    hidden = np.flatnonzero(np.isnan(result.optical.t_camera_brick_mm[:, 0]))
+    columns = np.arange(artist._cursor[hidden[2]], artist._cursor[hidden[-3]])
+    plot = artist._strip[drawing._WORDS_ROWS + 34 :, columns].astype(int)
+    assert len(columns) > 10
+    inked = [(np.abs(plot - ink).max(axis=2) < 60).any(axis=0) for ink in drawing.AXES]
+    assert inked[2].all()  # drawn last; it hides the others where they cross
+    assert min(np.mean(columns) for columns in inked) > 0.5
+
+
 def test_no_rest_is_said(result, monkeypatch):
     words = words_of(OverlayArtist.of(replace(result, rest=None), WIDTH, HEIGHT), 3, BLACK, monkeypatch)
     assert any("from the camera" in text for text in words)
