@@ -101,8 +101,9 @@ def phase_jumps(acc_mps2: FloatArray) -> tuple[float, float] | None:
     off = np.minimum(off, _BEAT_CAP * float(np.percentile(np.abs(off), 75)))
     off -= off.mean()
     off /= max(float(off.std()), 1e-12)
-    steps = np.log(n / _FEWEST_JUMPS / _SHORTEST_BEAT) / np.log1p(0.5 / n)
-    beats = _SHORTEST_BEAT * np.exp(np.arange(int(steps)) * np.log1p(0.5 / n))
+    # The last jump moves by a sample from each beat to the next: of the nearest it is half a sample off.
+    steps = np.log(n / _FEWEST_JUMPS / _SHORTEST_BEAT) / np.log1p(1 / n)
+    beats = _SHORTEST_BEAT * np.exp(np.arange(int(steps)) * np.log1p(1 / n))
     sigma, beat, place = _likeliest_beat(off, beats)
     if sigma < _BEAT_SIGMA:
         return None
