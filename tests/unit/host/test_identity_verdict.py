@@ -61,6 +61,13 @@ def test_a_false_light_within_the_gate_of_a_hidden_led_is_left_out(off_px, colla
     np.testing.assert_allclose(found.poses.t_camera_brick_mm[found.row[0]], T[0], atol=0.1 if collar else 0.7)
 
 
+def test_two_false_lights_within_the_gates_of_hidden_leds_are_both_left_out():
+    # Each bends the pose so that the other one fits the better: without one of them alone little is gained.
+    found = verdict([[7, 1, 2, 8, 4, 5, 6]], off=[(0, (6.0, -7.0)), (3, (6.0, -7.0))])
+    assert found.blob_of_led[0].tolist() == [-1, 1, 2, -1, 4, 5, 6]
+    assert not found.has_rival[0]
+
+
 def test_what_lights_cannot_tell_apart_is_left_out_and_the_rest_stands():
     # Two lights a tenth of a pixel apart, either of which may be m3.
     found = verdict([[0, 1, 2, 3, 4, 5, 6], [0, 1, 2, 7, 4, 5, 6]], off=[(3, (0.1, 0.0))])
@@ -82,7 +89,7 @@ def test_the_one_led_beside_a_line_stands_by_lesser_odds_than_leds_that_can_be_s
 def test_the_one_led_beside_a_line_is_doubted_where_another_turn_about_the_line_fits_as_well():
     """Of m2 where it is, and a false light where m6 would be, were the brick turned about the column."""
     middle = P[COLUMN].mean(axis=0)
-    turn = R[0] @ matrix_from_rvec(np.radians([0.0, 10.0, 0.0]))
+    turn = R[0] @ matrix_from_rvec(np.radians([0.0, 5.0, 0.0]))
     turned, _ = predict_brick(turn[None], T + (R[0] - turn) @ middle, CAMERA, BRICK, collar_mm=COLLAR)
     off = turned.uv_px[0, 6] - SEEN.uv_px[0, 6]
     assert np.linalg.norm(off) > 10  # px: of m6 as it is there is no light

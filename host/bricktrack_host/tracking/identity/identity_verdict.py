@@ -101,6 +101,10 @@ class Pictures:
             np.concatenate([kept[best], assigned[reduced]]),
             np.concatenate([best, np.flatnonzero(reduced)]),
         )
+        # Two false lights may bear each other out.
+        again_at, less = _each_left_out(without, at)
+        two = verified.is_scattered[again_at]
+        at, without = np.append(at, again_at[two]), np.concatenate([without, less[two]])
         answer = np.where(row[:, None] >= 0, kept[row], -1)
         log_odds = _log_odds(
             answer,
