@@ -26,8 +26,7 @@ _MISPLACED_RADII = {True: (0.0, 0.01, 0.04), False: (0.003, 0.01, 0.04)}
 codec, glare, lens, or a profile that no collar describes, do worse."""
 _MISPLACED_SHARE = {True: (0.8, 0.15, 0.05), False: (0.5, 0.3, 0.2)}
 _SPEEDS = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0])
-"""Shares of what is not known of the motion that the brick may move at, at rest first. A shaken brick passes
-slow speeds quickly, and shakes are of any strength: between all speeds alike and all their logarithms."""
+"""Shares of what is not known of the motion that the brick may move at: at rest, or at any speed alike."""
 _AT_REST = 0.5
 _AREA_SDS = np.array([0.03, 0.1, 0.2])
 """Of the logarithm of an LED's area over the predicted one, in one picture, alike likely: clean ones leave
@@ -230,8 +229,8 @@ def _of_lights(
         )
         log_density.append(np.log(share) + by_speed)
         chi2.append(at_rest - turned * (tilt**2).sum(axis=-1))
-    moving = np.sqrt(_SPEEDS)
-    shares = np.where(_SPEEDS > 0, (1 - _AT_REST) * moving / moving.sum(), _AT_REST)
+    shares = np.full(len(_SPEEDS), (1 - _AT_REST) / (len(_SPEEDS) - 1))
+    shares[0] = _AT_REST
     places = np.logaddexp.reduce(np.logaddexp.reduce(log_density, axis=0) + np.log(shares), axis=1)
     return places + _of_areas(given.area_px2, shown.area_px2, kept & given.is_whole), chi2[0]
 
