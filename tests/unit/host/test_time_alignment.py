@@ -84,6 +84,13 @@ def test_wrong_axes_are_not_believed():
     assert "axes" in a.reason
 
 
+def test_what_turns_while_no_sample_is_there_is_no_bias_of_the_gyro():
+    shake = simulate_shake(10, duration_s=4.0, imu_gaps=((1.9, 2.3),))
+    found = align_times(shake.optical, shake.imu)
+    # Attitudes of 0.1 degrees, 45 frames in 1.4 s on either side, tell a rate to 0.0005 rad/s: four of these.
+    assert found.gyro_bias_radps == pytest.approx([0.008, -0.005, 0.011], abs=0.002)
+
+
 def test_gaps_on_both_sides_do_not_matter():
     s = simulate_shake(
         10, offset_s=-0.03, dropouts=((1.5, 2.0), (5.0, 5.4)), imu_gaps=((3.0, 3.06), (4.2, 4.6))

@@ -206,25 +206,31 @@ class RotationFit:
             offset, skew = offset + float(np.clip(step[0], -0.02, 0.02)), skew + float(step[1])
             if iteration == 2:
                 # A bias left in turns the axes in which the errors are compared.
-                bias, bias_covariance = self._bias(t, attitude, drift, sd * self._sd[inside])
+                bias, bias_covariance = self._bias(t, segment[inside], attitude, drift, sd * self._sd[inside])
                 self._remove_bias(bias)
             elif abs(step[0]) < 1e-7 and iteration > 3:
                 break
-        bias, bias_covariance = self._bias(t, attitude, drift, sd * self._sd[inside])
+        bias, bias_covariance = self._bias(t, segment[inside], attitude, drift, sd * self._sd[inside])
         misfit = 3 * float(np.minimum(residual**2, _MISFIT_CAP * sd**2).sum())
         bias_sd = np.sqrt(np.diag(bias_covariance))
         return Fit(offset, skew, lost, self._gyro_bias + bias, bias_sd, covariance, sd, misfit, n)
 
     @staticmethod
     def _bias(
-        t: FloatArray, attitude: FloatArray, drift: FloatArray, sd_rad: FloatArray
+        t: FloatArray, segment: IntArray, attitude: FloatArray, drift: FloatArray, sd_rad: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the bias, and its covariance, of ``drift = const - integral of attitude @ bias``."""
+        """Return the bias, and its covariance, of ``drift = const - integral of attitude @ bias``.
+
+        With a constant of its own for each stretch between gaps: what turned in a gap is no bias.
+        """
         span = np.concatenate([[0.0], np.diff(t)])[:, None, None]
         integral = np.cumsum(span * attitude, axis=0)
-        design = np.concatenate([-integral, np.broadcast_to(np.eye(3), attitude.shape)], axis=2)
-        A = (design / sd_rad[:, None, None]).reshape(-1, 6)
-        covariance = np.asarray(np.linalg.inv(A.T @ A + np.eye(6)), dtype=np.float64)
+        stretch = segment[:, None] == np.unique(segment)
+        constants = np.einsum("ns,ij->nisj", stretch, np.eye(3)).reshape(len(t), 3, -1)
+        design = np.concatenate([-integral, constants], axis=2)
+        n = design.shape[2]
+        A = (design / sd_rad[:, None, None]).reshape(-1, n)
+        covariance = np.asarray(np.linalg.inv(A.T @ A + np.eye(n)), dtype=np.float64)
         bias = covariance @ (A.T @ (drift / sd_rad[:, None]).reshape(-1))
         return np.asarray(bias[:3], dtype=np.float64), covariance[:3, :3]
 
