@@ -87,6 +87,25 @@ def test_a_slip_among_frames_without_a_pose_leaves_them_out(shake):
     assert "in between left out" in found.words()[-1]
 
 
+def test_a_slip_within_a_gap_of_the_inertial_samples_is_at_the_interval_that_is_longer():
+    shake = simulate_shake(6, duration_s=4.0, offset_s=0.002, imu_gaps=((1.9, 2.3),))
+    frame = round(2.1 * 30.0058)
+    (one,) = search(shake, slip(shake.optical, frame, 1)).slips
+    assert (one.first, one.last, one.late_periods) == (frame, frame, 1)
+    # Pictures lost leave no such interval: all frames within the gap may be the first behind.
+    early = search(shake, slip(shake.optical, frame, -1))
+    (one,) = early.slips
+    assert one.first < frame - 3 and one.last > frame + 3 and one.late_periods == -1
+    assert early.left_out[one.first + 1 : one.last - 1].all()
+
+
+def test_a_gap_of_the_inertial_samples_is_no_slip():
+    shake = simulate_shake(6, duration_s=4.0, offset_s=0.002, imu_gaps=((1.9, 2.3),))
+    kept = np.setdiff1d(np.arange(len(shake.optical.t_ns)), [63])
+    assert search(shake, shake.optical) is None
+    assert search(shake, rows_of(shake.optical, kept)) is None
+
+
 def test_clocks_that_promise_nothing_do_not_tell_which_side_is_right(shake):
     found = search(shake, slip(shake.optical, 100, 1), prior_sd_ns=0.25e9)
     assert not found.is_side_told

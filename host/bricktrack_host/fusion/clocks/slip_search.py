@@ -26,7 +26,7 @@ from bricktrack_host.fusion.clocks.slip_search_kernel import (
     turns_from_gyro,
 )
 from bricktrack_host.fusion.clocks.stamp_regularity import stamp_regularity
-from bricktrack_host.fusion.clocks.stamp_slips import StampSlip, StampSlips, mend
+from bricktrack_host.fusion.clocks.stamp_slips import StampSlip, StampSlips, may_slip_at, mend
 from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.fusion.inertial.imu_samples import BRIDGE_PERIODS, seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
@@ -42,6 +42,7 @@ _RIVAL = 40.0  # and against every other number of periods
 _COARSE = 0.3  # of both, while the clocks are those that were found with the slips in the stamps
 _DOUBT = 16.0  # by which a place may be less likely than the best: four sigmas
 _MEMORY_S = 0.5  # over which the gyro holds an attitude: its noise, bias and scale drift by more
+_UNKNOWN_RAD = 0.5  # what a brick turns while no sample tells
 _LEAST_SCALE = 0.3  # of attitudes that are better than their covariance says
 _MEDIAN_CHI2_3 = 2.366
 _SIGMA = 4.0
@@ -171,7 +172,7 @@ def _turns(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, perio
     period_s = period_ns * 1e-9
     shifts_s = np.arange(-3 * _MOST_PERIODS - 1, 3 * _MOST_PERIODS + 2) * period_s / 3
     t_s = seconds_since(alignment.imu_time_ns(optical.t_ns[frame]), signal.epoch_ns)[:, None] + shifts_s
-    whole = ~signal.in_gap(t_s[:, [0, -1]], least_periods=BRIDGE_PERIODS).any(axis=1)
+    whole = ~signal.in_gap(t_s, least_periods=BRIDGE_PERIODS).any(axis=1)
     frame, t_s = frame[whole], t_s[whole]
     if len(frame) < MIN_POSES:
         return []
@@ -186,6 +187,10 @@ def _turns(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, perio
     interval_s = np.diff(t_s[:, 0], prepend=t_s[0, 0])
     # A mean whose variance grows so remembers about this long.
     drift = np.median(variance) * period_s * interval_s / _MEMORY_S**2
+    # Across a gap the gyro holds no attitude at all.
+    at_s = t_s[:, t_s.shape[1] // 2]
+    long_s = signal.gaps_s[np.diff(signal.gaps_s, axis=1)[:, 0] > BRIDGE_PERIODS * signal.period_s, 0]
+    drift[1:][np.diff(np.searchsorted(long_s, at_s)) > 0] = _UNKNOWN_RAD**2
     return [
         _Turns(frame, np.ascontiguousarray(error[:, third::3]), variance, drift, interval_s / period_s, ms)
         for third, ms in ((1, 0.0), (0, -period_ns / 3), (2, period_ns / 3))
@@ -251,14 +256,15 @@ def _slips(
     late = np.full(n, base - shifts[0])
     slips: list[StampSlip] = []
     for i in range(1, len(shifts)):
-        places = _places(turns, ends, shifts, i)
-        first, last = int(turns.frame[places.min() - 1]) + 1, int(turns.frame[places.max()])
-        best = slice(int(turns.frame[places[0] - 1]) + 1, int(turns.frame[places[0]]) + 1)
-        # Where frames without a pose lie between: behind the longest interval that the stamps have there.
-        frame = best.start + int(np.argmax(np.diff(optical.t_ns[best.start - 1 : best.stop])))
         step = shifts[i - 1] - shifts[i]
+        between = [np.arange(turns.frame[k - 1], turns.frame[k]) + 1 for k in _places(turns, ends, shifts, i)]
+        may_slip = [frames[may_slip_at(optical, frames, step, period_ns)] for frames in between]
+        likeliest, *others = [frames for frames in may_slip if frames.size] or between
+        # Where several frames lie between two that have turns: behind the longest interval of the stamps.
+        frame = int(likeliest[np.argmax(optical.t_ns[likeliest] - optical.t_ns[likeliest - 1])])
         late[frame:] = base - shifts[i]
-        slips.append(StampSlip(frame, first, last, step))
+        candidates = np.concatenate([likeliest, *others])
+        slips.append(StampSlip(frame, int(candidates.min()), int(candidates.max()), step))
     return mend(optical, slips, late, period_ns=period_ns, is_side_told=is_side_told, alignment=alignment)
 
 

@@ -11,6 +11,7 @@ from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import OpticalTrack
 
 _MOVES = 22.5  # chi-square with six degrees of freedom, once in a thousand
+_OWN_PERIODS = 0.5  # more than this after the frame before: a picture of its own
 _DOUBLE_PERIODS = 0.25  # less than this after the frame before: the same picture once more
 
 
@@ -151,18 +152,39 @@ def mend(
     return StampSlips(tuple(slips), period_ns, late_periods, t_ns, left_out, sd_ns, is_side_told, alignment)
 
 
+def may_slip_at(optical: OpticalTrack, frames: IntArray, late_periods: int, period_ns: float) -> BoolArray:
+    """Return at which frames, from 1, the stamps can begin to be so many periods late, shape (n,).
+
+    Each picture has an instant of its own: stamps that come late leave an interval that is as much longer, or
+    the picture is there twice, with the same pose. Stamps that come early, pictures lost, show neither.
+    """
+    left_periods = (optical.t_ns[frames] - optical.t_ns[frames - 1]) / period_ns - max(late_periods, 0)
+    known = has_pose(optical)
+    return np.array(
+        [
+            left > _OWN_PERIODS or not (known[i] and known[i - 1]) or not _differ(optical, i, i - 1)
+            for i, left in zip(frames.tolist(), left_periods.tolist(), strict=True)
+        ],
+        dtype=np.bool_,
+    )
+
+
 def _may_move(optical: OpticalTrack, periods: IntArray) -> BoolArray:
     """Return which frames have no pose, or move within so many frames by more than poses scatter."""
     n = len(optical.t_ns)
     out = ~has_pose(optical)
-    for i in np.flatnonzero((periods > 0) & ~out):
+    for i in np.flatnonzero((periods > 0) & ~out).tolist():
         beside = [k for d in range(1, int(periods[i]) + 1) for k in (i - d, i + d) if 0 <= k < n]
-        for k in (k for k in beside if not out[k]):
-            turn = rvec_from_matrix(optical.R_camera_brick[k].T @ optical.R_camera_brick[i])
-            off = np.append(turn, optical.t_camera_brick_mm[i] - optical.t_camera_brick_mm[k])
-            both = optical.covariance[i] + optical.covariance[k]
-            out[i] |= bool(off @ np.linalg.solve(both, off) > _MOVES)
+        out[i] |= any(_differ(optical, i, k) for k in beside if not out[k])
     return np.asarray(out)
+
+
+def _differ(optical: OpticalTrack, i: int, k: int) -> bool:
+    """Return whether two frames' poses are apart by more than poses scatter."""
+    turn = rvec_from_matrix(optical.R_camera_brick[k].T @ optical.R_camera_brick[i])
+    off = np.append(turn, optical.t_camera_brick_mm[i] - optical.t_camera_brick_mm[k])
+    both = optical.covariance[i] + optical.covariance[k]
+    return bool(off @ np.linalg.solve(both, off) > _MOVES)
 
 
 def _without_copies(t_ns: IntArray, period_ns: float) -> tuple[IntArray, BoolArray]:
