@@ -39,6 +39,8 @@ def overlay(
     from bricktrack_host.viewing.overlay_video import write_overlay
 
     path = output or Path(f"{run.resolve().name}_overlay.mp4")
+    if path.suffix.lower() != ".mp4":
+        raise ConfigError(f"--output {path}: the film is an MP4; name it {path.stem}.mp4")
     columns = TextColumn("drawing"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task("")

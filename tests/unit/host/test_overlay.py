@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bricktrack_common.errors import ConfigError
+from bricktrack_host.cli.overlay import overlay
 from bricktrack_host.viewing import overlay as drawing
 from bricktrack_host.viewing.overlay import STRIP_ROWS, UNUSED, USED, OverlayArtist
 
@@ -122,3 +124,9 @@ def test_no_rest_is_said(result, monkeypatch):
     words = words_of(OverlayArtist.of(replace(result, rest=None), WIDTH, HEIGHT), 3, BLACK, monkeypatch)
     assert any("from the camera" in text for text in words)
     assert any("SIMULATED" in text for text in words)
+
+
+@pytest.mark.parametrize("name", ["film.txt", "film.avi", "film", "mp4"])
+def test_a_name_that_is_no_films_is_refused_before_anything_is_read(tmp_path, name):
+    with pytest.raises(ConfigError, match=r"the film is an MP4; name it film\.mp4|name it mp4\.mp4"):
+        overlay(tmp_path / "no_run", output=tmp_path / name)
