@@ -149,7 +149,7 @@ def tight_result(
     chi2_of_led, rejected = np.full(shape, np.nan), np.zeros(shape, dtype=np.bool_)
     chi2_of_led[leds.frame, leds.led], rejected[leds.frame, leds.led] = done.chi2, ~use
     if rejected.any():
-        logger.warning("%d of %d LED centroids left out as outliers", rejected.sum(), len(use))
+        logger.info("%d of %d LED centroids left out as outliers", rejected.sum(), len(use))
     check = cross_check(track, pose_level.track)
     if not check.agrees:
         logger.warning(

@@ -29,6 +29,7 @@ from bricktrack_host.tracking.pose.refine import LedMotion
 from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1
+_MUCH_REJECTED = 0.01  # of the LED centroids; a spark or a glint now and then harms nothing
 # How far samples are to be believed, how far scales are off, and what a vibration leaves in samples decides
 # about dropouts and impacts. Within a frame's 20 ms it cannot be seen (`scripts/bench_retime.py`).
 _WITHIN_FRAMES = FusionSettings(
@@ -204,17 +205,24 @@ def _fuse_tight(
         camera="static" if inertial.camera is None else inertial.camera.kind,
         camera_imu=inertial.camera, camera_alignment=inertial.camera_alignment,
     )  # fmt: skip
-    n_rejected = int(np.count_nonzero(tight.led_rejected))
-    if n_rejected == 1:
-        problems.append("1 LED centroid disagrees with all the others and was left out")
-    elif n_rejected:
-        problems.append(f"{n_rejected} LED centroids disagree with all the others and were left out")
+    problems.extend(words_on_rejected(tight.led_rejected, np.isfinite(tight.led_chi2)))
     if not tight.check.agrees:
         problems.append(
             f"fusion LED by LED and pose by pose are up to {tight.check.max_mm:.2f} mm apart, in "
             f"{100 * tight.check.share_apart:.0f} % of the instants by more than their uncertainty allows"
         )
     return tight
+
+
+def words_on_rejected(is_rejected: BoolArray, is_fused: BoolArray) -> list[str]:
+    """Return what to say of LED centroids left out, both of shape (n_frames, n_leds); a few are usual."""
+    n, n_seen = int(np.count_nonzero(is_rejected)), int(np.count_nonzero(is_rejected | is_fused))
+    if n <= _MUCH_REJECTED * n_seen:
+        return []
+    return [
+        f"{n} of {n_seen} LED centroids ({100 * n / n_seen:.1f} %) disagree with all the others and were "
+        "left out"
+    ]
 
 
 def with_ray_errors(

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.pose_by_pose.moving_camera import align_both
 from bricktrack_host.stages.clocks import Inertial
-from bricktrack_host.stages.motion import OutputGrid, fuse_run
+from bricktrack_host.stages.motion import OutputGrid, fuse_run, words_on_rejected
 from bricktrack_host.tracking.optical_track import solve_poses
 
 
@@ -35,3 +35,13 @@ def test_a_camera_sensor_in_wrong_axes_is_doubted_though_leds_are_followed():
 
     assert "does not fit" not in said(0)
     assert "does not fit" in said(15)
+
+
+def test_a_centroid_left_out_now_and_then_is_no_point_to_read():
+    fused, rejected = np.ones((60, 5), dtype=bool), np.zeros((60, 5), dtype=bool)
+    fused[:, 4] = False
+    rejected.ravel()[:2] = True
+    assert words_on_rejected(rejected, fused) == []  # 2 of 240
+    rejected.ravel()[2:4] = True
+    assert "4 of 240 LED centroids (1.7 %)" in words_on_rejected(rejected, fused)[0]
+    assert words_on_rejected(rejected[:0], fused[:0]) == []
