@@ -4,13 +4,19 @@ Stamps that step or scatter were made elsewhere, or edited, or the camera paused
 both sides, the inertial samples tell which.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
-from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
+from bricktrack_common.arrays import FloatArray, IntArray, rows_of
+from bricktrack_host.fusion.clocks.offset_change import (
+    CLOCK_RATE_SD,
+    SIGMA,
+    OffsetChange,
+    change_of_halves,
+    offset_change,
+)
 from bricktrack_host.fusion.clocks.stamp_regularity import (
     JITTER_NS,
     MIN_FRAMES,
@@ -18,100 +24,11 @@ from bricktrack_host.fusion.clocks.stamp_regularity import (
     StampStep,
     stamp_regularity,
 )
-from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
-from bricktrack_host.fusion.inertial.imu_samples import seconds_since
-from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, has_pose
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _WINDOW_S = 3.0  # of motion on either side of a step
-_CLOCK_RATE_SD = 1e-4  # of two crystals against each other
-_FREE_RATE_SD = 5e-3  # of a sensor's own clock, which a step may have falsified
-_FLOOR_S = 0.3e-3  # to which two fits of one offset agree, with all that their sd leave out
-_SIGMA = 4.0
-
-
-@dataclass(frozen=True, slots=True)
-class OffsetChange:
-    """By how much the offset of IMU and camera differs between two stretches of a run, s, by rotations."""
-
-    change_s: float
-    sd_s: float
-
-
-def offset_change(
-    optical: OpticalTrack,
-    imu: ImuTrack,
-    alignment: TimeAlignment,
-    *,
-    split_ns: int,
-    from_ns: int,
-    to_ns: int,
-    rate_sd: float | None = None,
-) -> OffsetChange | None:
-    """Return by how much the offset of IMU and camera changes at an instant, by the rotations on both sides.
-
-    Parameters
-    ----------
-    optical : OpticalTrack
-    imu : ImuTrack
-        In brick axes.
-    alignment : TimeAlignment
-        Of the whole run.
-    split_ns, from_ns, to_ns : int, ns, camera time
-        The instant, and what to look at around it.
-    rate_sd : float, optional
-        Of the clocks against each other on either side; else what crystals hold, or a sensor's own clock.
-
-    Returns
-    -------
-    change : OffsetChange or None
-        Later less earlier, s; None where the run has no offset by its motion, or one side turns too little.
-    """
-    if alignment.source != "data":
-        return None
-    # The skew of the whole run has taken up most of any step: each side begins without.
-    alignment = replace(alignment, skew=0.0)
-    clock = alignment.sample_clock
-    signal = ImuSignal.from_track(
-        imu if clock is None else clock.restamp(imu), gyro_filter_s=alignment.gyro_filter_s
-    )
-    seen = has_pose(optical) & (optical.t_ns >= from_ns) & (optical.t_ns <= to_ns)
-    is_after = optical.t_ns >= split_ns
-    if rate_sd is None:
-        rate_sd = _CLOCK_RATE_SD if clock is None else _FREE_RATE_SD
-    earlier = _offset(optical, alignment, signal, seen & ~is_after, rate_sd)
-    later = _offset(optical, alignment, signal, seen & is_after, rate_sd)
-    if earlier is None or later is None:
-        return None
-    change_s, variance_s2 = 0.0, _FLOOR_S**2
-    split_s = float(seconds_since(alignment.imu_time_ns(np.array([split_ns])), signal.epoch_ns)[0])
-    for sign, (fit, mid_s) in ((-1.0, earlier), (1.0, later)):
-        # Each side's own rate carries it to the split.
-        at_split = np.array([1.0, split_s - mid_s])
-        change_s += sign * float(at_split @ [fit.offset_s, fit.skew])
-        variance_s2 += float(at_split @ fit.covariance[:2, :2] @ at_split)
-    return OffsetChange(change_s, float(np.sqrt(variance_s2)))
-
-
-def _offset(
-    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray, rate_sd: float
-) -> tuple[Fit, float] | None:
-    """Return what some frames say of the offset beyond the alignment's, and the middle of their times."""
-    if not frames.any():
-        return None
-    # In IMU time by the alignment: what is left to find is zero where it holds.
-    t_s = seconds_since(alignment.imu_time_ns(optical.t_ns[frames]), signal.epoch_ns)
-    sd_rad = np.sqrt(np.trace(optical.covariance[frames][:, :3, :3], axis1=1, axis2=2) / 3)
-    solver = RotationFit(
-        t_s,
-        optical.R_camera_brick[frames],
-        np.maximum(sd_rad, MIN_ROTATION_SD_RAD),
-        signal,
-        skew_prior_sd=rate_sd,
-    )
-    fit = solver.solve(0.0)
-    return None if fit is None else (fit, float(0.5 * (t_s[0] + t_s[-1])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,8 +93,8 @@ def check_stamps(
         problems.append(_step_words(step, frame, regularity.period_ns, change, verdict))
     spread_ns = max(levels_ns) - min(levels_ns)
     if not regularity.steps and imu is not None and alignment is not None:
-        change = _change_of_halves(optical, imu, alignment)
-        if change is not None and abs(change.change_s) > _SIGMA * change.sd_s:
+        change = change_of_halves(optical, imu, alignment)
+        if change is not None and change.is_sure:
             is_contradicted, spread_ns = True, abs(change.change_s) * 1e9
             problems.append(
                 "the offset of IMU and camera changes by "
@@ -238,10 +155,10 @@ def _verdict(step: StampStep, change: OffsetChange | None) -> Literal["stamps", 
     """Return what the motion says of a step: the stamps are wrong, the camera paused, or nothing."""
     if change is None:
         return "unknown"
-    if abs(change.change_s) > _SIGMA * change.sd_s:
+    if change.is_sure:
         return "stamps"
     # Stamps that step up make the offset step down.
-    excluded = abs(change.change_s + step.size_ns * 1e-9) > _SIGMA * change.sd_s
+    excluded = abs(change.change_s + step.size_ns * 1e-9) > SIGMA * change.sd_s
     return "paused" if excluded else "unknown"
 
 
@@ -269,14 +186,6 @@ def _step_words(
     return f"{found}. The {moved}, too unsure to tell whether the stamps are wrong. {doubt}"
 
 
-def _change_of_halves(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> OffsetChange | None:
-    t_ns = optical.t_ns[has_pose(optical)]
-    return offset_change(
-        optical, imu, alignment,
-        split_ns=int(t_ns[len(t_ns) // 2]), from_ns=int(t_ns[0]), to_ns=int(t_ns[-1]), rate_sd=_FREE_RATE_SD,
-    )  # fmt: skip
-
-
 def _runs_apart(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> bool:
     """Return whether the two clocks drift by more than crystals do, and by more than a sample is old.
 
@@ -284,6 +193,6 @@ def _runs_apart(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) 
     before it is found out: less than that is its samples' age, which the rate of the alignment follows.
     """
     span_ns = float(optical.t_ns[-1] - optical.t_ns[0])
-    beyond = abs(alignment.skew) > _SIGMA * np.hypot(alignment.skew_sd, _CLOCK_RATE_SD)
+    beyond = abs(alignment.skew) > SIGMA * np.hypot(alignment.skew_sd, CLOCK_RATE_SD)
     drift_ns = abs(alignment.skew) * span_ns
     return bool(alignment.source == "data" and beyond and drift_ns > np.median(np.diff(imu.t_ns)))

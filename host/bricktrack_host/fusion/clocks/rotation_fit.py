@@ -23,6 +23,8 @@ GRID_S = 0.004  # of the cross-correlation
 _NODE_S = 0.0025  # of the integrated gyro
 _KNOT_S = 0.5  # of the slow drift between integrated gyro and optics: its noise, bias and scale error
 _AMBIGUOUS_SIGMA = 5.0
+_GYRO_AXES_SD = 0.02  # of scales, and of axes in rad: consumer sensors, and a layout measured by hand
+_ROBUST_ROUNDS = 4
 _MISFIT_CAP = 25.0
 LOSS_PRIOR_SD_S2 = 2e-5  # of c: 4.5 ms squared, the BNO055's narrower settings
 
@@ -214,6 +216,49 @@ class RotationFit:
         misfit = 3 * float(np.minimum(residual**2, _MISFIT_CAP * sd**2).sum())
         bias_sd = np.sqrt(np.diag(bias_covariance))
         return Fit(offset, skew, lost, self._gyro_bias + bias, bias_sd, covariance, sd, misfit, n)
+
+    def time_errors(
+        self, basis: FloatArray, prior_sd_s: FloatArray, gyro_bias_radps: FloatArray
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return errors of the frames' times as a sum of functions, and their covariance; linear, from zero.
+
+        Scales and axes of the gyro are free beside them within what sensors have. None where too few frames
+        have gyro beside them.
+
+        Parameters
+        ----------
+        basis : ndarray, shape (n_frames, c)
+            Functions of the frames' times, to be added to them.
+        prior_sd_s : ndarray, shape (c,), s
+        gyro_bias_radps : ndarray, shape (3,)
+        """
+        inside, segment = self._frames_beside_gyro(0.0)
+        if inside.sum() < MIN_POSES:
+            return None
+        t, inverse_sd, n_basis = self._t[inside], 1 / self._sd[inside], basis.shape[1]
+        knot, share, n_knots = self._hats(t, segment[inside])
+        self._remove_bias(gyro_bias_radps)
+        attitude, error, design = compare_with_gyro(
+            self._pieces, self._nodes, self._attitude, gyro_bias_radps, t, np.zeros_like(t), self._R[inside]
+        )
+        turned = np.diff(self._signal.angle_at(t), axis=0) - np.diff(t)[:, None] * gyro_bias_radps
+        by_axes = 0.5 * (attitude[1:] + attitude[:-1])[:, :, :, None] * turned[:, None, None, :]
+        by_axes = np.concatenate([np.zeros((1, 3, 9)), np.cumsum(by_axes.reshape(-1, 3, 9), axis=0)])
+        by_time = basis[inside][:, None, :] * design[:, :, :1]
+        columns = np.concatenate([by_time, design[:, :, 2:], by_axes, error[:, :, None]], axis=2)
+        sd = np.concatenate([prior_sd_s, [LOSS_PRIOR_SD_S2], np.full(9, _GYRO_AXES_SD)])
+        scale, weight = 1.0, inverse_sd
+        for _ in range(_ROBUST_ROUNDS):
+            flat = columns.reshape(len(t), -1)
+            white = (flat - drift_of(weight, knot, share, n_knots, flat)).reshape(columns.shape)
+            A = (white * weight[:, None, None]).reshape(-1, columns.shape[2])
+            information = A[:, :-1].T @ A[:, :-1] / scale**2 + np.diag(sd**-2.0)
+            found = np.linalg.solve(information, A[:, :-1].T @ A[:, -1] / scale**2)
+            left = np.linalg.norm(white[:, :, -1] - white[:, :, :-1] @ found, axis=1) / np.sqrt(3)
+            # The median of sqrt(chi-square of 3 / 3) is 0.888.
+            scale = max(float(np.median(left * inverse_sd)) / 0.888, 1e-6)
+            weight = inverse_sd * (1 + (left * inverse_sd / (2.5 * scale)) ** 2) ** -0.25
+        return found[:n_basis], np.linalg.inv(information)[:n_basis, :n_basis]
 
     @staticmethod
     def _bias(

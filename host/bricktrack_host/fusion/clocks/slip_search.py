@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_host.fusion.clocks.frame_stamps import offset_change
+from bricktrack_host.fusion.clocks.offset_change import offset_change
 from bricktrack_host.fusion.clocks.rotation_fit import MIN_POSES, correlate
 from bricktrack_host.fusion.clocks.rotation_fit_kernel import integrated_attitudes
 from bricktrack_host.fusion.clocks.slip_search_kernel import (

@@ -1,0 +1,130 @@
+"""By how much the offset of IMU and camera changes within a run, by the rotations that both saw."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
+from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
+from bricktrack_host.fusion.inertial.imu_samples import seconds_since
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.tracks import ImuTrack, OpticalTrack
+
+CLOCK_RATE_SD = 1e-4  # of two crystals against each other
+SIGMA = 4.0
+_FREE_RATE_SD = 5e-3  # of a sensor's own clock, which a step may have falsified
+_FLOOR_S = 0.3e-3  # to which two fits of one offset agree, with all that their sd leave out
+_UNKNOWN_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetChange:
+    """By how much the offset of IMU and camera differs between two stretches of a run, s, by rotations."""
+
+    change_s: float
+    sd_s: float
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it is more than chance."""
+        return abs(self.change_s) > SIGMA * self.sd_s
+
+
+def offset_change(
+    optical: OpticalTrack,
+    imu: ImuTrack,
+    alignment: TimeAlignment,
+    *,
+    split_ns: int,
+    from_ns: int,
+    to_ns: int,
+) -> OffsetChange | None:
+    """Return by how much the offset of IMU and camera changes at an instant, by the rotations on both sides.
+
+    Parameters
+    ----------
+    optical : OpticalTrack
+    imu : ImuTrack
+        In brick axes.
+    alignment : TimeAlignment
+        Of the whole run.
+    split_ns, from_ns, to_ns : int, ns, camera time
+        The instant, and what to look at around it.
+
+    Returns
+    -------
+    change : OffsetChange or None
+        Later less earlier, s; None where the run has no offset by its motion, or one side turns too little.
+    """
+    if alignment.source != "data":
+        return None
+    # The skew of the whole run has taken up most of any step: each side begins without.
+    alignment = replace(alignment, skew=0.0)
+    clock, signal = alignment.sample_clock, _signal(imu, alignment)
+    seen = has_pose(optical) & (optical.t_ns >= from_ns) & (optical.t_ns <= to_ns)
+    is_after = optical.t_ns >= split_ns
+    rate_sd = CLOCK_RATE_SD if clock is None else _FREE_RATE_SD
+    earlier = _offset(optical, alignment, signal, seen & ~is_after, rate_sd)
+    later = _offset(optical, alignment, signal, seen & is_after, rate_sd)
+    if earlier is None or later is None:
+        return None
+    change_s, variance_s2 = 0.0, _FLOOR_S**2
+    split_s = float(seconds_since(alignment.imu_time_ns(np.array([split_ns])), signal.epoch_ns)[0])
+    for sign, (fit, mid_s) in ((-1.0, earlier), (1.0, later)):
+        # Each side's own rate carries it to the split.
+        at_split = np.array([1.0, split_s - mid_s])
+        change_s += sign * float(at_split @ [fit.offset_s, fit.skew])
+        variance_s2 += float(at_split @ fit.covariance[:2, :2] @ at_split)
+    return OffsetChange(change_s, float(np.sqrt(variance_s2)))
+
+
+def change_of_halves(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> OffsetChange | None:
+    """Return by how much the offset changes half-way, where either half may have a rate of its own.
+
+    A gyro whose scale or axes are off by a per cent looks like it, where the brick turns far to one side:
+    they are free here. None as of `offset_change`.
+    """
+    if alignment.source != "data":
+        return None
+    frames = has_pose(optical)
+    fit, t_s = _fit_of(optical, alignment, _signal(imu, alignment), frames, _FREE_RATE_SD)
+    since_s = t_s - t_s[len(t_s) // 2]
+    is_later = (since_s >= 0).astype(np.float64)
+    found = fit.time_errors(
+        np.stack([np.ones(len(t_s)), since_s, is_later, is_later * since_s], axis=1),
+        np.array([_UNKNOWN_S, _FREE_RATE_SD, _UNKNOWN_S, _FREE_RATE_SD]),
+        alignment.gyro_bias_radps,
+    )
+    if found is None or found[1][2, 2] > (0.5 * _UNKNOWN_S) ** 2:
+        return None
+    return OffsetChange(float(found[0][2]), float(np.sqrt(found[1][2, 2] + _FLOOR_S**2)))
+
+
+def _signal(imu: ImuTrack, alignment: TimeAlignment) -> ImuSignal:
+    clock = alignment.sample_clock
+    return ImuSignal.from_track(
+        imu if clock is None else clock.restamp(imu), gyro_filter_s=alignment.gyro_filter_s
+    )
+
+
+def _fit_of(
+    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray, rate_sd: float
+) -> tuple[RotationFit, FloatArray]:
+    """Return the fit of some frames, and their times: those of the IMU by the alignment."""
+    t_s = seconds_since(alignment.imu_time_ns(optical.t_ns[frames]), signal.epoch_ns)
+    sd_rad = np.sqrt(np.trace(optical.covariance[frames][:, :3, :3], axis1=1, axis2=2) / 3)
+    sd_rad = np.maximum(sd_rad, MIN_ROTATION_SD_RAD)
+    return RotationFit(t_s, optical.R_camera_brick[frames], sd_rad, signal, skew_prior_sd=rate_sd), t_s
+
+
+def _offset(
+    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray, rate_sd: float
+) -> tuple[Fit, float] | None:
+    """Return what some frames say of the offset beyond the alignment's, and the middle of their times."""
+    if not frames.any():
+        return None
+    # In IMU time by the alignment: what is left to find is zero where it holds.
+    solver, t_s = _fit_of(optical, alignment, signal, frames, rate_sd)
+    fit = solver.solve(0.0)
+    return None if fit is None else (fit, float(0.5 * (t_s[0] + t_s[-1])))
