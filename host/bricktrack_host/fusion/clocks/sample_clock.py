@@ -96,41 +96,15 @@ def find_sample_clock(
     if earned < (-_EARN if search.has_repeats else _EARN):
         return None
 
-    def clock_of(way: SawTooth) -> SampleClock:
-        sample, period_ns = search.samples(way), search.period_s * (1 + way.rate) * 1e9
-        first_ns = signal.epoch_ns + round(search.first_sample_s(way) * 1e9 + float(sample[0]) * period_ns)
-        read = np.flatnonzero((imu.flags & int(UNUSABLE)) == 0)
-        skipped = np.maximum(np.diff(sample[read]) - np.diff(read), 0)
-        return SampleClock(first_ns, period_ns, sample - sample[0], int(skipped.sum()))
-
-    def fit_of(clock: SampleClock, way: SawTooth) -> Fit | None:
-        restamped = ImuSignal.from_track(clock.restamp(imu))
-        at_s = t_s + (signal.epoch_ns - restamped.epoch_ns) * 1e-9
-        solver = RotationFit(at_s, R, sd_rad, restamped, skew_prior_sd=RATE_SD)
-        return solver.solve(offset_s + way.lag_s)
-
-    def best_of(ways: list[SawTooth]) -> tuple[SawTooth, SampleClock, Fit] | None:
-        """Return the way under which the attitudes agree best with the gyro, all else that is known added."""
-        tried = []
-        for way in ways:
-            clock = clock_of(way)
-            fit = fit_of(clock, way)
-            if fit is not None:
-                tried.append((way, clock, fit))
-        if not tried:
-            return None
-        sd = min(fit.residual_sd for _, _, fit in tried)
-        return min(tried, key=lambda one: one[2].misfit / sd**2 + one[0].read_cost)
-
-    near = search.ways(way, rate_sd=STEP_S / search.span_s)[:1]
-    found = best_of(near)
-    if found is None:
+    judge = _Judge(t_s, R, sd_rad, signal, imu, search, offset_s)
+    judge.hear(search.ways(way, rate_sd=STEP_S / search.span_s))
+    if not judge.heard:
         return None
-    # The attitudes know the rate better than the rotations between frames, whichever way is right: once more
-    # with theirs.
-    way, _, fit = found
-    way = replace(way, rate=way.rate - fit.skew)
-    _, clock, fit = best = best_of(search.ways(way, rate_sd=_RATE_STEP)) or found
+    # The attitudes know the rate better than the rotations between frames: once more with theirs.
+    best = judge.best
+    judge.hear(search.ways(replace(best.way, rate=best.rate), rate_sd=_RATE_STEP))
+    best = judge.best
+    clock, fit = judge.clock(replace(best.way, rate=best.rate), best.sample), best.fit
     if not search.has_repeats:
         # Stamps at a wrong rate are a straight line and no saw-tooth, and so is one that never wraps.
         read = np.flatnonzero((imu.flags & int(UNUSABLE)) == 0)
@@ -140,7 +114,89 @@ def find_sample_clock(
             return None
     logger.info(
         "the inertial sensor samples by its own clock, %.0f ppm slow; %d samples were not read",
-        best[0].rate * 1e6,
+        best.rate * 1e6,
         clock.n_skipped,
     )
     return clock
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Heard:
+    """One sequence of samples found by the reads, and what speaks for it.
+
+    ``way`` is the likeliest saw-tooth that leads to it, ``rate`` the one that the attitudes find under it,
+    and ``read_cost`` the chi-square of the reads and of that between the two rates.
+    """
+
+    way: SawTooth
+    sample: IntArray
+    fit: Fit
+    rate: float
+    read_cost: float
+
+    def led_to_by(self, way: SawTooth) -> "_Heard":
+        """Return the same with this saw-tooth, if that is likelier."""
+        off = (way.rate - self.rate) ** 2 / (_RATE_STEP**2 + float(self.fit.covariance[1, 1]))
+        cost = way.read_cost + off
+        return replace(self, way=way, read_cost=cost) if cost < self.read_cost else self
+
+
+class _Judge:
+    """Tells which sequence of samples is the likeliest, by how the attitudes agree with the gyro under each.
+
+    Saw-tooths differ in more than the sequence; but their rates and phases the fit sets right by itself.
+    """
+
+    def __init__(
+        self,
+        t_s: FloatArray,
+        R: FloatArray,
+        sd_rad: FloatArray,
+        signal: ImuSignal,
+        imu: ImuTrack,
+        search: SawToothSearch,
+        offset_s: float,
+    ) -> None:
+        self._t_s, self._R, self._sd_rad = t_s, R, sd_rad
+        self._signal, self._imu, self._search, self._offset_s = signal, imu, search, offset_s
+        self.heard: list[_Heard] = []
+
+    def clock(self, way: SawTooth, sample: IntArray) -> SampleClock:
+        """Return the clock of a sequence."""
+        period_ns = self._search.period_s * (1 + way.rate) * 1e9
+        first_s = self._search.first_sample_s(way)
+        first_ns = self._signal.epoch_ns + round(first_s * 1e9 + float(sample[0]) * period_ns)
+        read = np.flatnonzero((self._imu.flags & int(UNUSABLE)) == 0)
+        skipped = np.maximum(np.diff(sample[read]) - np.diff(read), 0)
+        return SampleClock(first_ns, period_ns, sample - sample[0], int(skipped.sum()))
+
+    def hear(self, ways: list[SawTooth]) -> None:
+        """Fit the attitudes to every sequence of samples that was not heard before."""
+        for way in ways:
+            sample = self._search.samples(way)
+            step = np.diff(sample)
+            for i, known in enumerate(self.heard):
+                if (np.diff(known.sample) == step).all():
+                    self.heard[i] = known.led_to_by(way)
+                    break
+            else:
+                fit = self._fit(way, sample)
+                if fit is not None:
+                    new = _Heard(way, sample, fit, way.rate - fit.skew, np.inf)
+                    self.heard.append(new.led_to_by(way))
+
+    def _fit(self, way: SawTooth, sample: IntArray) -> Fit | None:
+        restamped = ImuSignal.from_track(self.clock(way, sample).restamp(self._imu))
+        at_s = self._t_s + (self._signal.epoch_ns - restamped.epoch_ns) * 1e-9
+        solver = RotationFit(at_s, self._R, self._sd_rad, restamped, skew_prior_sd=RATE_SD)
+        return solver.solve(self._offset_s + way.lag_s)
+
+    def costs(self) -> FloatArray:
+        """Return the chi-square of all that was heard, by the attitudes and by the reads."""
+        sd = min(one.fit.residual_sd for one in self.heard)
+        return np.array([one.fit.misfit / sd**2 + one.read_cost for one in self.heard])
+
+    @property
+    def best(self) -> _Heard:
+        """Return the likeliest."""
+        return self.heard[int(np.argmin(self.costs()))]
