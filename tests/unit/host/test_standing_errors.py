@@ -18,7 +18,7 @@ from bricktrack_host.fusion.smoothing.smoother import POS, Filter
 from bricktrack_host.tracking.optical_track import solve_poses
 
 SETTINGS = FusionSettings()
-PROFILE, SIZE, FIRST_LED = 21, 22, 23
+PROFILE, SIZE, FIRST_LED, BY_VIEW = 21, 22, 23, 37
 
 
 def smoothed(run):
@@ -128,8 +128,8 @@ def test_an_led_that_is_off_all_the_time_is_found():
     uv = run.observations.uv_px.copy()
     uv[:, 4, 0] += 0.3
     done = smoothed(replace(run, observations=replace(run.observations, uv_px=uv)))
-    offset = done.errors.value[FIRST_LED:].reshape(7, 2)
-    sd = np.sqrt(np.diagonal(done.errors.covariance))[FIRST_LED:].reshape(7, 2)
+    offset = done.errors.value[FIRST_LED:BY_VIEW].reshape(7, 2)
+    sd = np.sqrt(np.diagonal(done.errors.covariance))[FIRST_LED:BY_VIEW].reshape(7, 2)
     assert np.argmax(np.abs(offset[:, 0])) == 4
     # A part of it looks like a pose, which the sd says.
     assert abs(offset[4, 0] - 0.3) < 3 * sd[4, 0]

@@ -89,6 +89,8 @@ class Pictured:
         One standard deviation of what the profile leaves unknown, the same way in all LEDs.
     from_centre_px : ndarray, shape (m, 2)
         The predicted picture less the middle of the sensor's.
+    from_side_rad : ndarray, shape (m, 2)
+        How far beside an LED's mean line of sight, along the camera's first two axes, it is seen from.
     is_facing : ndarray of bool, shape (m,)
         Whether the dome can be seen at all from there.
     """
@@ -99,6 +101,7 @@ class Pictured:
     J_px: FloatArray
     profile_shift_px: FloatArray
     from_centre_px: FloatArray
+    from_side_rad: FloatArray
     is_facing: BoolArray
 
 
@@ -125,8 +128,18 @@ def picture(
         J_px=_by_pose(prediction, leds, R_camera_brick[0], brick),
         profile_shift_px=prediction.model_shift_px,
         from_centre_px=prediction.uv_px - 0.5 * np.array([mode.width - 1, mode.height - 1]),
+        from_side_rad=_from_side(leds, R_camera_brick[0], t_camera_brick_mm[0], brick),
         is_facing=np.asarray(prediction.facing > 0, dtype=np.bool_),
     )
+
+
+def _from_side(leds: SeenLeds, R: FloatArray, t_mm: FloatArray, brick: BrickModel) -> FloatArray:
+    """Return how far each line of sight lies from its LED's mean one, in brick axes, turned as at mid-run."""
+    sight = t_mm + np.einsum("mij,mj->mi", R, brick.led_positions_mm[leds.led])
+    sight = np.einsum("mji,mj->mi", R, sight / np.linalg.norm(sight, axis=1, keepdims=True))
+    count = np.maximum(np.bincount(leds.led, minlength=brick.n_leds), 1)
+    mean = np.stack([np.bincount(leds.led, axis, minlength=brick.n_leds) / count for axis in sight.T], axis=1)
+    return np.asarray((sight - mean[leds.led]) @ R[len(R) // 2].T[:, :2])
 
 
 def _predict(

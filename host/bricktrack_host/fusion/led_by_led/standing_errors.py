@@ -1,9 +1,11 @@
 """Errors that stand still over a run seen LED by LED: of the inertial sensor, and of the LEDs' pictures.
 
 What calibration, layout and profile leave of error in a centroid hardly changes while the brick moves by a
-few millimetres. Taken for noise it would average out over the frames, as it does not; taken for nothing the
-noise would be overstated. So a centroid's error is a noise that is new in every picture, and a part that
-stands still: of the profile and of the picture's size, common to all LEDs, and of each LED for itself. How
+few millimetres, and slowly as it turns. Taken for noise it would average out over the frames, as it does not;
+taken for nothing the noise would be overstated; and what changes with the view is taken for a pose that is
+off where it is believed to be constant, the more firmly the better the samples know how the brick turned. So
+a centroid's error is a noise that is new in every picture, and a part that stands still: of the profile and
+of the picture's size, common to all LEDs, and of each LED for itself, at each view its own. How
 large the latter is the LEDs say among themselves (`leds_among_themselves`).
 
 Like the errors of the inertial sensor (`sensor_errors`, which see for the method) these need not be states of
@@ -40,21 +42,31 @@ from bricktrack_host.tracking.pose.refine import OWN_SHARE
 _ARM = slice(18, N_ERRORS)
 _PROFILE, _SCALE = N_ERRORS, N_ERRORS + 1
 _FIRST_LED = N_ERRORS + 2
+_N_VIEWS = 6  # see `_by_view`
+_OF_LED = 2 * _N_VIEWS
 _SCALE_SD = 5e-5
 """Of the picture's size: light falls off towards its corners, also across the width of one LED, and draws the
 centroid inwards by some 0.02 px at 400 px from the centre; a lens that warms up does as much."""
+_ALIKE_RAD = 0.2
+"""Turned by so much, an LED's error is another one. In recordings by another renderer than this project's
+LEDs' errors changed by 5 to 10 times their size per radian (simulated)."""
 _OFFSET_SDS_PX = np.geomspace(0.005, 1.0, 30)
 """That single LEDs may be off by; any factor is as likely as the next before the run speaks."""
+_HIDDEN_SHARE = np.sqrt(2)
+"""Of single LEDs' errors, what is believed over what they show among themselves. To the pictures that show it
+the shape of the LEDs was fitted, and often their places: what looks like a pose was left. Recordings by
+another renderer than this project's had 1.4 times as much on the median (simulated)."""
 _STAND_SD = 0.5  # of an error: what is not yet taken out of the motion is not in its covariance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandingErrors:
-    """Errors that stand still, in one vector of q = 23 + 2 L, or 46 + 2 L where the camera moves.
+    """Errors that stand still, in one vector of q = 23 + 12 L, or 46 + 12 L where the camera moves.
 
     In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
     the profile's, in units of its stated sd; the picture's size over what it should be, less 1; (u, v) of
-    each of L LEDs, px; those of the sensor that moves with the camera, as in `CameraErrors.values`.
+    each of L LEDs, px, and five times as many that change with the view, see `_by_view`; those of the sensor
+    that moves with the camera, as in `CameraErrors.values`.
 
     Attributes
     ----------
@@ -62,7 +74,7 @@ class StandingErrors:
         As estimated.
     covariance : ndarray, shape (q, q)
     offset_sd_px : float
-        Of the errors of single LEDs, as the run says.
+        Of the errors of single LEDs, as they show among themselves.
     """
 
     value: FloatArray
@@ -75,14 +87,16 @@ class StandingErrors:
         """Return what was taken out of a run's sensor already, given where it was said to be."""
         gains = [(gain - np.eye(3)).ravel() for gain in (run.gyro_gain, run.acc_gain)]
         theirs = np.zeros(0) if run.camera is None else run.camera.errors.values()
-        value = np.concatenate([*gains, run.lever_arm_m - lever_arm_m, np.zeros(2 + 2 * n_leds), theirs])
+        value = np.concatenate(
+            [*gains, run.lever_arm_m - lever_arm_m, np.zeros(2 + _OF_LED * n_leds), theirs]
+        )
         return cls(value, np.zeros((len(value), len(value))), 0.0, n_leds)
 
     def of_sensor(self, *, since: "StandingErrors") -> SensorErrors:
         """Return what the inertial sensor's errors have changed by."""
         change = self.value - since.value
         gyro, acc = change[:18].reshape(2, 3, 3)
-        theirs = _FIRST_LED + 2 * self.n_leds
+        theirs = _FIRST_LED + _OF_LED * self.n_leds
         at = np.append(np.arange(N_ERRORS), np.arange(theirs, len(change)))
         camera = CameraErrors.of(change[theirs:]) if theirs < len(change) else None
         return SensorErrors(gyro, acc, change[_ARM], self.covariance[np.ix_(at, at)], camera)
@@ -94,11 +108,14 @@ class StandingErrors:
 
     def in_picture_px(self, leds: SeenLeds, pictured: Pictured) -> FloatArray:
         """Return by how much the centroids are off for them, shape (m, 2)."""
-        offset = self.value[_FIRST_LED : _FIRST_LED + 2 * self.n_leds].reshape(self.n_leds, 2)
+        of_leds = self.value[_FIRST_LED : _FIRST_LED + _OF_LED * self.n_leds].reshape(
+            _N_VIEWS, self.n_leds, 2
+        )
+        own = np.einsum("mk,kmi->mi", _by_view(pictured), of_leds[:, leds.led])
         common = (
             self.value[_PROFILE] * pictured.profile_shift_px + self.value[_SCALE] * pictured.from_centre_px
         )
-        return np.asarray(common + offset[leds.led])
+        return np.asarray(common + own)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,17 +151,20 @@ class StandingPrior:
         """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...)."""
         own = OWN_SHARE * self.led_shift_px
         last_led = _FIRST_LED + own.size
-        q = last_led + len(self.camera_sd)
+        by_view = slice(last_led, _FIRST_LED + _N_VIEWS * own.size)
+        q = by_view.stop + len(self.camera_sd)
         out = np.zeros((*np.shape(offset_sd_px), q, q))
         at = np.arange(q)
         out[..., at, at] = np.concatenate(
-            [self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(own.size), self.camera_sd**2]
+            [self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(_N_VIEWS * own.size), self.camera_sd**2]
         )
         for led, shift in enumerate(own):
             part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
             out[..., part, part] = np.outer(shift, shift)
         of_leds = at[_FIRST_LED:last_led]
         out[..., of_leds, of_leds] += np.square(offset_sd_px)[..., None]
+        of_profile = np.tile(np.repeat(0.5 * np.square(own).sum(axis=1), 2), _N_VIEWS - 1)
+        out[..., at[by_view], at[by_view]] = np.square(offset_sd_px)[..., None] + of_profile
         return out
 
 
@@ -208,7 +228,7 @@ class StandingWay:
         belief = self._among_themselves.belief(of_pictures, known[part])
         weight = np.exp(belief - belief.max())
         offset_sd_px = float(np.sqrt((weight * _OFFSET_SDS_PX**2).sum() / weight.sum()))
-        believed = prior.covariance(offset_sd_px)
+        believed = prior.covariance(_HIDDEN_SHARE * offset_sd_px)
         _, value = _likeliest(believed, known, normal, pull)
         covariance = np.linalg.solve(np.eye(len(known)) + believed @ normal, believed)
         return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px, n_leds)
@@ -232,6 +252,16 @@ class StandingWay:
         return replace(estimate, covariance=covariance, variance=variance, doubt=doubt[:, None])
 
 
+def _by_view(pictured: Pictured) -> FloatArray:
+    """Return what of an LED's errors of one px each sight has, shape (m, _N_VIEWS).
+
+    The first stays as it is; the others are the first terms of errors alike within `_ALIKE_RAD`, whose
+    likeness falls off as a Gaussian does.
+    """
+    x, y = pictured.from_side_rad.T / _ALIKE_RAD
+    return np.stack([np.ones_like(x), x, y, x * x / np.sqrt(2), x * y, y * y / np.sqrt(2)], axis=1)
+
+
 def _own_part(
     problem: Problem, leds: SeenLeds, pictured: Pictured, n_leds: int, camera: CameraWay | None
 ) -> FloatArray:
@@ -240,12 +270,13 @@ def _own_part(
     if arrays is None:
         raise ValueError("the problem has no LEDs")
     m = len(leds.t_ns)
-    own = np.zeros((m, 2, _FIRST_LED + 2 * n_leds))
+    own = np.zeros((m, 2, _FIRST_LED + _OF_LED * n_leds))
     own[:, :, _ARM] = arrays.J[..., 3:] @ arrays.R_lin
     own[:, :, _PROFILE], own[:, :, _SCALE] = -pictured.profile_shift_px, -pictured.from_centre_px
-    at = _FIRST_LED + 2 * leds.led
-    own[np.arange(m), 0, at] = -1.0
-    own[np.arange(m), 1, at + 1] = -1.0
+    for k, view in enumerate(_by_view(pictured).T):
+        at = _FIRST_LED + 2 * (n_leds * k + leds.led)
+        own[np.arange(m), 0, at] = -view
+        own[np.arange(m), 1, at + 1] = -view
     if camera is None:
         return own
     node = np.repeat(np.arange(len(problem.has_frame)), np.diff(arrays.first[:, 0]))
