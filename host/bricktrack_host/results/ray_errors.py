@@ -1,4 +1,4 @@
-"""What the calibration's rays leave unsure in poses: one error that a whole run shares.
+"""What the calibration's rays, and LEDs that show elsewhere, leave unsure in poses: one error of a whole run.
 
 The dots of a calibration are few and noisy, so its rays are off by a little, the same way in every frame.
 No residual of the run shows that. To first order a pose is off by ``[dtheta, dt] = A(pose) n`` with n
@@ -25,7 +25,7 @@ _LEAST_SHARE = 1e-4  # of the greatest variance; less than that is not kept
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayErrors:
-    """Errors of all poses of a run for which its calibration's rays are to blame.
+    """Errors of all poses of a run for which its calibration's rays, or its LEDs, are to blame.
 
     Attributes
     ----------
@@ -88,7 +88,9 @@ def _sum_of_factors(weights: FloatArray, factors: FloatArray) -> FloatArray:
     return np.asarray((pairs @ products.reshape(len(i), 36)).reshape(-1, 6, 6))
 
 
-def ray_errors(rays: CentralRays | TwoPlaneIrt, brick: BrickModel, about: Pose) -> RayErrors | None:
+def ray_errors(
+    rays: CentralRays | TwoPlaneIrt, brick: BrickModel, about: Pose, *, led_sd_px: FloatArray | None = None
+) -> RayErrors | None:
     """Return what a calibration's covariance means for poses near one; `None` where it cannot be told.
 
     Poses are those that fit the LEDs in the picture best, by least squares of pixels.
@@ -99,6 +101,8 @@ def ray_errors(rays: CentralRays | TwoPlaneIrt, brick: BrickModel, about: Pose) 
     brick : BrickModel
     about : Pose
         Of the brick in the camera frame, as at rest.
+    led_sd_px : ndarray, shape (n_leds,), px, optional
+        How far each LED may show elsewhere in either direction, the same way in all pictures; else none does.
     """
     mode = rays.sensor_mode
     uv_px = rays.project(about.apply(brick.led_positions_mm)).uv_px
@@ -106,17 +110,20 @@ def ray_errors(rays: CentralRays | TwoPlaneIrt, brick: BrickModel, about: Pose) 
     if np.count_nonzero(inside) < _LEAST_LEDS:
         return None
     leds_mm = brick.led_positions_mm[inside]
-    by_rays = _by_rays(rays, leds_mm, about)
+    sd_px = np.zeros(len(leds_mm)) if led_sd_px is None else led_sd_px[inside]
+    by_errors = _by_errors(rays, leds_mm, about, sd_px)
     slopes = []
     for step in np.diag(_STEP):
-        ahead, behind = (_by_rays(rays, leds_mm, _moved(about, side * step)) for side in (1.0, -1.0))
+        ahead, behind = (_by_errors(rays, leds_mm, _moved(about, side * step), sd_px) for side in (1.0, -1.0))
         slopes.append((ahead - behind) / 2)
-    stacked = np.stack([by_rays, *slopes])  # slopes as steps, so that rows compare in size
+    stacked = np.stack([by_errors, *slopes])  # slopes as steps, so that rows compare in size
     if not np.isfinite(stacked).all():
         return None
     stacked = stacked.reshape(42, -1)
     in_units = np.tile(1 / _STEP, 7)[:, None]
-    values, vectors = np.linalg.eigh((in_units * stacked) @ rays.covariance @ (in_units * stacked).T)
+    n_rays = len(rays.covariance)
+    by_rays, by_leds = in_units * stacked[:, :n_rays], in_units * stacked[:, n_rays:]
+    values, vectors = np.linalg.eigh(by_rays @ rays.covariance @ by_rays.T + by_leds @ by_leds.T)
     kept = values > _LEAST_SHARE * values[-1]
     factors = (vectors[:, kept] * np.sqrt(values[kept]) / in_units).reshape(7, 6, -1)
     return RayErrors(about, factors[0], factors[1:] / _STEP[:, None, None])
@@ -126,17 +133,21 @@ def _moved(pose: Pose, step: FloatArray) -> Pose:
     return Pose(pose.R @ matrix_from_rvec(step[:3]), pose.t_mm + step[3:])
 
 
-def _by_rays(rays: CentralRays | TwoPlaneIrt, leds_mm: FloatArray, pose: Pose) -> FloatArray:
-    """Return the derivative, shape (6, p), of the error of a pose by the parameters of the rays.
+def _by_errors(
+    rays: CentralRays | TwoPlaneIrt, leds_mm: FloatArray, pose: Pose, led_sd_px: FloatArray
+) -> FloatArray:
+    """Return the derivative, shape (6, p + 2 n_leds), of the error of a pose by what errs.
 
-    A ray that truly passes at e beside where it is believed lets its LED appear where one at -e would be
-    believed: ``J [dp/dtheta, dp/dt] [dtheta, dt] = J_xy e`` in pixels, for all LEDs by least squares.
+    By the p parameters of the rays: a ray that truly passes at e beside where it is believed lets its LED
+    appear where one at -e would be believed: ``J [dp/dtheta, dp/dt] [dtheta, dt] = J_xy e`` in pixels, for
+    all LEDs by least squares. And by each LED's u and v, in units of its sd.
     """
     points_mm = pose.apply(leds_mm)
     seen = rays.project(points_mm)
     J = seen.J_px_per_mm
     by_pose = np.concatenate([-J @ (pose.R @ skew(leds_mm)), J], axis=2).reshape(-1, 6)
     by_rays = J[:, :, :2] @ rays.point_derivatives(seen.uv_px, points_mm[:, 2])
+    by_all = np.concatenate([by_rays.reshape(len(by_pose), -1), np.diag(np.repeat(-led_sd_px, 2))], axis=1)
     if not np.isfinite(by_pose).all():
-        return np.full((6, by_rays.shape[2]), np.nan)
-    return np.asarray(np.linalg.pinv(by_pose * _STEP) @ by_rays.reshape(len(by_pose), -1) * _STEP[:, None])
+        return np.full((6, by_all.shape[1]), np.nan)
+    return np.asarray(np.linalg.pinv(by_pose * _STEP) @ by_all * _STEP[:, None])

@@ -41,7 +41,7 @@ from bricktrack_host.tracking.centroid_noise import with_measured_noise
 from bricktrack_host.tracking.copied_frames import with_copied_frames_left_out
 from bricktrack_host.tracking.frame_errors import frame_errors
 from bricktrack_host.tracking.led_fit import with_profile_of_run
-from bricktrack_host.tracking.led_sizes import words_on_sizes
+from bricktrack_host.tracking.led_sizes import led_sizes
 from bricktrack_host.tracking.odd_leds import with_odd_leds_doubted, words_on_odd_leds, words_on_unused_leds
 from bricktrack_host.tracking.optical_track import solve_poses, start_poses
 from bricktrack_host.tracking.pose.finite import all_finite
@@ -100,7 +100,8 @@ def solve_run(
             observations, rays, brick, rolling_shutter=settings.rolling_shutter, first=first
         )
     _require_poses(optical, run, brick)
-    problems += words_on_sizes(observations, optical, rays, brick)
+    sizes = led_sizes(observations, optical, rays, brick)
+    problems += sizes.words(brick)
     with stages("align clocks"):
         edge_fit = fit_square_wave(run, problems)
         imu = choose_imu(run, brick, settings, problems)
@@ -122,7 +123,9 @@ def solve_run(
         fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
         optical, fused = with_unsure_times(optical, fused, time_sd_ns)
         fused = with_restamped_told(optical, fused)
-        errors_of_rays = ray_errors(calibration.ray_model, brick, _pose_at_rest(optical, rest))
+        errors_of_rays = ray_errors(
+            calibration.ray_model, brick, _pose_at_rest(optical, rest), led_sd_px=sizes.sd_px
+        )
         if errors_of_rays is None:
             problems.append(
                 "where the brick stood, fewer than four LEDs lie in the picture: the standard deviations "

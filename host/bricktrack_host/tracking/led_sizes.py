@@ -5,8 +5,11 @@ Where that befalls most LEDs alike, they agree with each other on a pose that is
 that shows itself alone looks like the odd one. Their size gives them away.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from bricktrack_common.arrays import FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_host.tracking.led_model.led_profile import collar_of, predict_brick
@@ -22,10 +25,50 @@ _MIN_FRAMES = 5
 _UNKNOWN_COLLAR_RADII = 0.2
 
 
-def words_on_sizes(
+@dataclass(frozen=True, slots=True, eq=False)
+class LedSizes:
+    """How large the lights are.
+
+    Attributes
+    ----------
+    ratio : ndarray, shape (n_leds,)
+        Of their area over what layout and pose explain, the median of frames; NaN where too few tell.
+    radius_px : ndarray, shape (n_leds,), px
+        What is expected.
+    """
+
+    ratio: FloatArray
+    radius_px: FloatArray
+
+    @property
+    def sd_px(self) -> FloatArray:
+        """How far the middle of each light may lie elsewhere, in either direction, shape (n_leds,).
+
+        A second disc of the same size, d beside the first, adds 2 r d to the area and moves the middle by
+        d / 2: by pi / 4 of the radius times the excess, in a direction that nothing tells.
+        """
+        excess = np.where(np.nan_to_num(self.ratio) > _LARGER, self.ratio - 1, 0.0)
+        return np.asarray(np.pi / 4 * excess * np.nan_to_num(self.radius_px) / np.sqrt(2))
+
+    def words(self, brick: BrickModel) -> list[str]:
+        """Return what to say of LEDs whose light is larger than the layout's radius and collar explain."""
+        large = np.flatnonzero(self.sd_px)
+        if not large.size:
+            return []
+        named = ", ".join(f"{brick.led_names[k]} {self.ratio[k]:.2f}" for k in large)
+        return [
+            f"LEDs look larger than the layout has them ({named} times the area): run together with their "
+            "reflections or with glare, or of another radius. Their middles are then elsewhere, and all "
+            "poses off alike, by millimetres along the view: the standard deviations hold that, and no more "
+            "can be believed. Look at 'bricktrack overlay RUN'; dull what reflects, expose shorter, or "
+            "correct the radii"
+        ]
+
+
+def led_sizes(
     observations: LedObservations, optical: OpticalTrack, rays: RayModel, brick: BrickModel
-) -> list[str]:
-    """Return what to say of LEDs whose light is larger than the layout's radius and collar explain.
+) -> LedSizes:
+    """Return how large the lights are against what layout and poses explain.
 
     Parameters
     ----------
@@ -42,18 +85,13 @@ def words_on_sizes(
     )
     well = observations.led_flags[frames] == _SEEN_WELL
     well &= (observations.area_px2[frames] > 0) & (expected.facing > 0)
-    ratio = np.divide(
-        observations.area_px2[frames], expected.area_px2, out=np.full(well.shape, np.nan), where=well
-    )
     enough = well.sum(axis=0) >= _MIN_FRAMES
-    of_led = np.array([np.nanmedian(r) if e else np.nan for r, e in zip(ratio.T, enough, strict=True)])
-    large = np.flatnonzero(np.nan_to_num(of_led) > _LARGER)
-    if not large.size:
-        return []
-    named = ", ".join(f"{brick.led_names[k]} {of_led[k]:.2f}" for k in large)
-    return [
-        f"LEDs look larger than the layout has them ({named} times the area): run together with their "
-        "reflections or with glare, or of another radius. Their middles are then elsewhere, and poses may be "
-        "millimetres off by more than they state. Look at 'bricktrack overlay RUN'; dull what reflects, "
-        "expose shorter, or correct the radii"
-    ]
+
+    def median(values: FloatArray) -> FloatArray:
+        return np.array(
+            [np.median(v[w]) if e else np.nan for v, w, e in zip(values.T, well.T, enough, strict=True)]
+        )
+
+    seen_px2, expected_px2 = observations.area_px2[frames], expected.area_px2
+    ratio = np.divide(seen_px2, expected_px2, out=np.full(well.shape, np.nan), where=well)
+    return LedSizes(median(ratio), np.sqrt(median(expected_px2) / np.pi))

@@ -9,7 +9,7 @@ from pinhole import PinholeCamera
 
 from bricktrack_common.brick_model import ProfileEntry
 from bricktrack_host.quality import LedFlag
-from bricktrack_host.tracking.led_sizes import words_on_sizes
+from bricktrack_host.tracking.led_sizes import LedSizes, led_sizes
 from bricktrack_host.tracking.optical_track import solve_poses
 from bricktrack_host.tracks import LedObservations
 
@@ -42,25 +42,39 @@ def scene():
 @pytest.mark.parametrize("factor", [0.7, 0.9, 1.1])
 def test_lights_of_about_their_leds_size_are_passed_over(scene, factor):
     seen, track = scene
-    assert words_on_sizes(replace(seen, area_px2=factor * seen.area_px2), track, CAMERA, BRICK) == []
+    assert led_sizes(replace(seen, area_px2=factor * seen.area_px2), track, CAMERA, BRICK).words(BRICK) == []
 
 
 def test_lights_that_are_larger_are_named_with_how_much(scene):
     seen, track = scene
     large = replace(seen, area_px2=seen.area_px2 * [1, 1.4, 1, 1.45, 1, 1, 1])
-    (words,) = words_on_sizes(large, track, CAMERA, BRICK)
+    sizes = led_sizes(large, track, CAMERA, BRICK)
+    (words,) = sizes.words(BRICK)
     assert "(m1 1.40, m3 1.45 times the area)" in words
+    assert np.flatnonzero(sizes.sd_px).tolist() == [1, 3]
+
+
+def test_two_discs_that_ran_together_have_their_middle_as_far_off_as_is_said():
+    radius = 12.0
+    v, u = np.mgrid[-40:41, -40:41] / 1.0
+    disc = np.hypot(u, v) <= radius
+    for apart in (5.0, 8.0):
+        both = disc | (np.hypot(u - apart, v) <= radius)
+        ratio = both.sum() / disc.sum()
+        sizes = LedSizes(np.array([ratio, 1.0, np.nan]), np.array([radius, radius, np.nan]))
+        # In either direction; 5 % for discs on whole pixels, and for an overlap that is no rectangle.
+        assert sizes.sd_px * np.sqrt(2) == pytest.approx([u[both].mean(), 0, 0], rel=0.05)
 
 
 def test_an_unknown_profile_is_no_reason_to_doubt(scene):
     seen, track = scene
-    assert words_on_sizes(seen, track, CAMERA, replace(BRICK, led_profile=None)) == []
+    assert led_sizes(seen, track, CAMERA, replace(BRICK, led_profile=None)).words(BRICK) == []
 
 
 def test_lights_that_are_flagged_anyway_and_frames_without_a_pose_do_not_count(scene):
     seen, track = scene
     large = replace(seen, area_px2=seen.area_px2 * 1.5)
     merged = replace(large, led_flags=np.full((N, 7), int(LedFlag.MERGED)))
-    assert words_on_sizes(merged, track, CAMERA, BRICK) == []
+    assert led_sizes(merged, track, CAMERA, BRICK).words(BRICK) == []
     lost = replace(track, t_camera_brick_mm=np.full((N, 3), np.nan))
-    assert words_on_sizes(large, lost, CAMERA, BRICK) == []
+    assert led_sizes(large, lost, CAMERA, BRICK).words(BRICK) == []

@@ -57,6 +57,26 @@ def calibrations(request):
     return found
 
 
+def test_leds_that_show_elsewhere_put_poses_as_far_off_as_stated():
+    rays = FITS["central"](two_planes(brown, 0, board=BOARD, noise_px=0.02))
+    sd_px = np.array([2.0, 1.0, 3.0, 0.0, 2.0, 2.0, 1.0])
+    covariance = ray_errors(rays, LAYOUT, REST, led_sd_px=sd_px).covariance(REST.R[None], REST.t_mm[None])[0]
+    seen, rng, normalised = rays.project(REST.apply(LEDS_MM)).uv_px, np.random.default_rng(3), []
+    for _ in range(40):
+        uv = seen + rng.normal(size=(7, 2)) * sd_px[:, None]
+
+        def moved(x):
+            return Pose(REST.R @ Rotation.from_rotvec(x[:3]).as_matrix(), REST.t_mm + 100 * x[3:])
+
+        found = least_squares(
+            lambda x, uv=uv: (rays.project(moved(x).apply(LEDS_MM)).uv_px - uv).ravel(), np.zeros(6)
+        )
+        e = off(moved(found.x), REST)
+        normalised.append(e @ np.linalg.solve(covariance, e))
+    # Three deviations of the mean of chi squared of 6 over 6.
+    assert np.mean(normalised) / 6 == pytest.approx(1, abs=3 * np.sqrt(2 / (6 * 40)))
+
+
 def test_poses_are_as_far_off_as_stated(calibrations):
     normalised = []
     for rays, *poses in calibrations:
