@@ -82,6 +82,8 @@ class ImuTrack:
     flags : ndarray of int64, shape (n,), `bricktrack_common.imu_records.ImuFlag`
     acc_range_mps2 : float
         Where the accelerometer clips.
+    t_sd_s : ndarray, shape (n,), s, or None
+        How unsure each stamp is by itself, where a sample may belong to another slot.
     """
 
     t_ns: IntArray
@@ -89,6 +91,7 @@ class ImuTrack:
     gyro_radps: FloatArray
     flags: IntArray
     acc_range_mps2: float
+    t_sd_s: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

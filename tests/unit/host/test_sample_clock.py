@@ -91,6 +91,13 @@ def test_stamps_at_a_wrong_rate_are_no_saw_tooth(seed):
     assert alignment.sample_clock is None
 
 
+def test_stamps_are_as_unsure_as_the_numbers_of_the_samples():
+    run = simulate_run(6, duration_s=3.0)
+    sample_sd = np.linspace(0.0, 0.5, len(run.imu.t_ns))
+    clock = SampleClock(0, 1e7, np.arange(len(sample_sd)), 0, sample_sd)
+    np.testing.assert_allclose(clock.restamp(run.imu).t_sd_s, 0.01 * sample_sd)
+
+
 def test_a_clock_serves_only_the_track_it_was_found_for():
     run = simulate_run(6, duration_s=3.0)
     clock = SampleClock(0, 1e7, np.arange(7), 0)

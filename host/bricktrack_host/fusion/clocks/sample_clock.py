@@ -39,12 +39,15 @@ class SampleClock:
         Which sample each read found.
     n_skipped : int
         Samples that no read found, though there was one in every slot.
+    sample_sd : ndarray, shape (n,), or None
+        How unsure ``sample`` is, where others are nearly as likely; in samples.
     """
 
     first_ns: int
     period_ns: float
     sample: IntArray
     n_skipped: int
+    sample_sd: FloatArray | None = None
 
     def restamp(self, imu: ImuTrack) -> ImuTrack:
         """Return the track with the instants of measurement for stamps; samples read twice are flagged.
@@ -62,7 +65,8 @@ class SampleClock:
         flags = imu.flags.copy()
         flags[1:][np.diff(self.sample) == 0] |= int(ImuFlag.REPEAT)
         t_ns = self.first_ns + np.round(self.sample * self.period_ns).astype(np.int64)
-        return replace(imu, t_ns=t_ns, flags=flags)
+        t_sd_s = None if self.sample_sd is None else self.sample_sd * (self.period_ns * 1e-9)
+        return replace(imu, t_ns=t_ns, flags=flags, t_sd_s=t_sd_s)
 
 
 def find_sample_clock(
@@ -105,6 +109,7 @@ def find_sample_clock(
     judge.hear(search.ways(replace(best.way, rate=best.rate), rate_sd=_RATE_STEP))
     best = judge.best
     clock, fit = judge.clock(replace(best.way, rate=best.rate), best.sample), best.fit
+    clock = replace(clock, sample_sd=judge.sample_sd())
     if not search.has_repeats:
         # Stamps at a wrong rate are a straight line and no saw-tooth, and so is one that never wraps.
         read = np.flatnonzero((imu.flags & int(UNUSABLE)) == 0)
@@ -200,3 +205,11 @@ class _Judge:
     def best(self) -> _Heard:
         """Return the likeliest."""
         return self.heard[int(np.argmin(self.costs()))]
+
+    def sample_sd(self) -> FloatArray:
+        """Return how unsure each read's sample is, in samples, shape (n,): all that was heard by its odds."""
+        costs, likeliest = self.costs(), self.best.sample
+        off = np.array([one.sample - likeliest for one in self.heard], dtype=np.float64)
+        off -= np.median(off, axis=1, keepdims=True)  # what all samples share is the offset's
+        odds = np.exp(-0.5 * (costs - costs.min()))
+        return np.asarray(np.sqrt(odds @ off**2 / odds.sum()))

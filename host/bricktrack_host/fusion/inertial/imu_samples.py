@@ -169,6 +169,8 @@ class CleanSamples:
         Above zero where samples that broke a vibration were filled.
     fill : Fill or None
         What stands for those missing in long gaps.
+    t_sd_s : ndarray, shape (n,), or None
+        How unsure each stamp is by itself.
     """
 
     epoch_ns: int
@@ -178,6 +180,7 @@ class CleanSamples:
     clip_sd_mps2: FloatArray
     filled_sd_mps2: FloatArray
     fill: Fill | None = None
+    t_sd_s: FloatArray | None = None
 
     def without_gains(self, gyro_gain: FloatArray, acc_gain: FloatArray) -> "CleanSamples":
         """Return the samples without the gains, shape (3, 3), that they have over the truth."""
@@ -225,4 +228,5 @@ def clean_samples(imu: ImuTrack, *, mend: bool = True) -> CleanSamples:
     if mend and is_vibrating(acc):
         mended = mend_vibration(gyro, acc, roughness(acc)[0])
         gyro, acc, filled_sd = mended.gyro_radps, mended.acc_mps2, mended.acc_sd_mps2
-    return CleanSamples(epoch_ns, t_s, gyro, acc, clip_sd, filled_sd)
+    t_sd_s = None if imu.t_sd_s is None else imu.t_sd_s[use]
+    return CleanSamples(epoch_ns, t_s, gyro, acc, clip_sd, filled_sd, t_sd_s=t_sd_s)

@@ -95,6 +95,10 @@ def noise_parts(
     gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
     shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
     acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2
+    t_sd_s = signal.samples.t_sd_s
+    if t_sd_s is not None:  # a sample that may belong to another slot
+        gyro_fixed = gyro_fixed + (_steepness(signal.gyro_radps, signal.t_s) * t_sd_s) ** 2
+        acc_fixed = acc_fixed + (_steepness(signal.acc_mps2, signal.t_s) * t_sd_s) ** 2
     gyro_rough = np.maximum(signal.gyro_roughness_radps**2 - s.gyro_noise_radps**2, 0.0)
     acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
     acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2
@@ -112,6 +116,11 @@ def noise_parts(
         acc_rough=at(acc_rough * period, lin.lag_s),
         acc_systematic=at(acc_systematic * hold, lin.lag_s),
     )
+
+
+def _steepness(values: FloatArray, t_s: FloatArray) -> FloatArray:
+    """Return how fast samples change, of the axis where it is most, shape (n,)."""
+    return np.asarray(np.abs(np.gradient(values, t_s, axis=0)).max(axis=1))
 
 
 def _without_vibration(values: FloatArray) -> FloatArray:
