@@ -21,7 +21,7 @@ from bricktrack_host.fusion.pose_by_pose.noise_choice import frames_log_likeliho
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
 
 _STEP_MM = 1.5  # of the differences by which the likelihood's curvature is had
-_ROUNDS = 2
+_MOST_ROUNDS, _SETTLED_MM = 10, 0.05  # of Newton's method
 _MAX_SD_MM, _MAX_SD_DEG = 1.0, 0.5
 _CHI_3_MEDIAN = 1.538  # median of the root of chi-square with 3 degrees of freedom
 _SURE_ARM_MM = 0.05  # while it is sought, its error is no noise
@@ -83,7 +83,8 @@ def refine_mount(
     Notes
     -----
     Axes: the rotation that takes the gyro's rotations between frames onto the camera's (Wahba's problem).
-    Place: Newton's method on the likelihood of the frames under the filter.
+    Place: Newton's method on the likelihood of the frames under the filter, with steps that raise it; not
+    told where it does not settle.
     """
     settings = settings or FusionSettings()
     arm = as_float_array("lever_arm_mm", lever_arm_mm, (3,))
@@ -150,20 +151,35 @@ def _place(
         return frames_log_likelihood(run, settings)
 
     h, unit = _STEP_MM, np.eye(3) * _STEP_MM
-    found, hessian = arm_mm.copy(), np.zeros((3, 3))
-    for _ in range(_ROUNDS):
-        here = log_likelihood(found)
+    found, here = arm_mm.copy(), log_likelihood(arm_mm)
+    has_settled = False
+    for _ in range(_MOST_ROUNDS):
         plus = np.array([log_likelihood(found + e) for e in unit])
         minus = np.array([log_likelihood(found - e) for e in unit])
         gradient = (plus - minus) / (2 * h)
         hessian = np.diag((plus + minus - 2 * here) / h**2)
         for i, j in ((0, 1), (0, 2), (1, 2)):
-            both = log_likelihood(found + unit[i] + unit[j])
-            hessian[i, j] = hessian[j, i] = (both - plus[i] - plus[j] + here) / h**2
+            along, across = unit[i] + unit[j], unit[i] - unit[j]
+            both = log_likelihood(found + along) + log_likelihood(found - along)
+            both -= log_likelihood(found + across) + log_likelihood(found - across)
+            hessian[i, j] = hessian[j, i] = both / (4 * h**2)
         told, axes = np.linalg.eigh(-hessian)
         good = told > 1 / 20.0**2  # a prior of 20 mm: along what is told less, the layout stands
-        step = axes[:, good] @ ((axes[:, good].T @ gradient) / told[good])
-        found = found + np.clip(step, -10.0, 10.0)
+        # Far away the likelihood may curve the other way: then too, uphill.
+        steep = np.abs(told) > 1 / 20.0**2
+        uphill = (axes[:, steep].T @ gradient) / np.abs(told[steep])
+        step = np.clip(axes[:, steep] @ uphill, -10.0, 10.0)
+        has_settled = bool((np.abs(step) < _SETTLED_MM).all())
+        there = log_likelihood(found + step)
+        while there < here and not has_settled:
+            step = 0.5 * step
+            has_settled = bool((np.abs(step) < _SETTLED_MM).all())
+            there = log_likelihood(found + step)
+        found, here = found + step, there
+        if has_settled:
+            break
+    if not has_settled:
+        return np.full(3, np.nan), np.full(3, np.inf)
     variance = (axes[:, good] ** 2 / told[good]).sum(axis=1)
     untold = (axes[:, ~good] ** 2).sum(axis=1) > 0.05
     return np.where(untold, np.nan, found), np.where(untold, np.inf, np.sqrt(variance))
