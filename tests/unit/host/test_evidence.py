@@ -17,8 +17,9 @@ WITHOUT_THE_LAST = np.arange(7) < 6
 
 
 def evidence(
-    off_px, *, kept=None, area=1.0, sd_px=0.06, whole=True, n_lights=7, guesses=1, dt_s=0.0, tilt=None
-):
+    off_px, *, kept=None, area=1.0, sd_px=0.06, whole=True, n_lights=7, guesses=1, dt_s=0.0, tilt=None,
+    J_tilt=None,
+):  # fmt: skip
     """Of one assignment, whose lights are off from where a pose shows the LEDs."""
     given = Given(
         uv_px=SEEN.uv_px + np.asarray(off_px, dtype=float),
@@ -30,9 +31,8 @@ def evidence(
         n_lights=np.array([n_lights]),
     )
     tilt = np.zeros(3) if tilt is None else np.asarray(tilt)
-    shown = Shown(
-        SEEN.uv_px, SEEN.area_px2, SEEN.facing, J, SEEN.model_shift_px, tilt[None], np.zeros((1, 3, 3))
-    )
+    J_tilt = np.zeros((3, 3)) if J_tilt is None else J_tilt
+    shown = Shown(SEEN.uv_px, SEEN.area_px2, SEEN.facing, J, SEEN.model_shift_px, tilt[None], J_tilt[None])
     kept = np.ones((1, 7), dtype=bool) if kept is None else np.asarray(kept)[None]
     return evidence_of(
         given, [shown] * guesses, kept, POSE[1][:, 2], n_pixels=N_PIXELS, min_leds=4, axes_length=0.5
@@ -138,6 +138,15 @@ def test_a_brick_turned_away_is_less_likely_by_how_its_leds_face():
     loss = evidence(r).log_ratio - evidence(r, tilt=[chord, 0.0, 0.0]).log_ratio
     # Of eight from all facing to none facing, axes whose mean is a half have four; at 60 degrees half of that.
     np.testing.assert_allclose(loss, 2.0, atol=1e-9)
+
+
+def test_what_is_seen_and_how_it_is_turned_may_be_told_from_any_pose_nearby():
+    r, turn = noise(0.06), np.array([0.05, -0.04, 0.03])
+    tilt, J_tilt = np.array([0.4, -0.2, 0.0]), 0.9 * np.eye(3)
+    from_there = evidence(r + J[0, :, :, :3] @ turn, tilt=tilt, J_tilt=J_tilt)
+    from_here = evidence(r, tilt=tilt + J_tilt @ turn, J_tilt=J_tilt)
+    # But for the width of the prior about either: 0.05 times the squared turn from the pose that is likeliest.
+    np.testing.assert_allclose(from_there.log_ratio, from_here.log_ratio, atol=1e-3)
 
 
 def test_the_area_of_one_led_tells_as_much_as_those_of_a_picture_of_one():

@@ -220,7 +220,7 @@ def _of_lights(
     cov = np.where(kept[..., None, None], given.cov_px2, np.eye(2))
     J_tilt, tilt = shown.J_tilt_per_turn, shown.tilt
     X_tilt = np.zeros((len(kept), 3, X.shape[-1]))
-    X_tilt[..., :3], X_tilt[..., -1] = J_tilt, tilt
+    X_tilt[..., :3], X_tilt[..., -1] = J_tilt, -tilt  # what is left of it, as the residual of the lights
     by_tilt = turned * np.swapaxes(X_tilt, -1, -2) @ X_tilt
     log_density, chi2 = [], []
     for share, radii in zip(_MISPLACED_SHARE[is_fitted], _MISPLACED_RADII[is_fitted], strict=True):
