@@ -123,7 +123,8 @@ def refuse_longer_rows(path: Path, rows: Sequence[Mapping[str | None, object]]) 
         With the row's number: numbers with a decimal comma would be read as two.
     """
     for i, row in enumerate(rows, 1):
-        if None in row:
+        surplus = row.get(None)
+        if isinstance(surplus, list) and any(surplus):  # a comma at the end of a line is no field
             raise RunFormatError(
                 f"{path}: row {i} has more fields than the first line names. Write numbers with points, and "
                 "commas between the fields only"

@@ -101,7 +101,6 @@ def solve_run(
         )
     _require_poses(optical, run, brick)
     sizes = led_sizes(observations, optical, rays, brick)
-    problems += sizes.words(brick)
     with stages("align clocks"):
         edge_fit = fit_square_wave(run, problems)
         imu = choose_imu(run, brick, settings, problems)
@@ -126,6 +125,7 @@ def solve_run(
         errors_of_rays = ray_errors(
             calibration.ray_model, brick, _pose_at_rest(optical, rest), led_sd_px=sizes.sd_px
         )
+        problems += sizes.words(brick, in_covariance=errors_of_rays is not None)
         if errors_of_rays is None:
             problems.append(
                 "where the brick stood, fewer than four LEDs lie in the picture: the standard deviations "

@@ -133,7 +133,7 @@ def fit_collar(
         what = (
             "The light lies farther in front than a half sphere's: the domes are taller, or the layout's "
             "positions lie behind the middles of their spheres. Correct the positions; or process with the "
-            "layout as it is, whose covariances hold that the shape is unknown"
+            "layout as it is, without a profile: covariances then allow for the unknown shape"
             if collar < 0
             else "Check the LEDs' axes and radii in the layout, and the calibration"
         )

@@ -19,7 +19,7 @@ from bricktrack_host.tracks import LedObservations, OpticalTrack
 _LARGER = 1.2
 """Of the area: on 18 recordings of an independent renderer, with lights dim to blown out and pictures sharp
 to blurred, the medians of LEDs that were seen alone are 0.90 to 1.03 of what is expected; with their own
-reflections run into them 1.4 to 1.5."""
+reflections run into them 1.4 to 1.5 (simulated)."""
 _SEEN_WELL = 0  # no flag: whole, alone, and not smeared
 _MIN_FRAMES = 5
 _UNKNOWN_COLLAR_RADII = 0.2
@@ -50,18 +50,18 @@ class LedSizes:
         excess = np.where(np.nan_to_num(self.ratio) > _LARGER, self.ratio - 1, 0.0)
         return np.asarray(np.pi / 4 * excess * np.nan_to_num(self.radius_px) / np.sqrt(2))
 
-    def words(self, brick: BrickModel) -> list[str]:
+    def words(self, brick: BrickModel, *, in_covariance: bool) -> list[str]:
         """Return what to say of LEDs whose light is larger than the layout's radius and collar explain."""
         large = np.flatnonzero(self.sd_px)
         if not large.size:
             return []
         named = ", ".join(f"{brick.led_names[k]} {self.ratio[k]:.2f}" for k in large)
+        hold = "hold that, and no more can be believed" if in_covariance else "do not hold that"
         return [
             f"LEDs look larger than the layout has them ({named} times the area): run together with their "
             "reflections or with glare, or of another radius. Their middles are then elsewhere, and all "
-            "poses off alike, by millimetres along the view: the standard deviations hold that, and no more "
-            "can be believed. Look at 'bricktrack overlay RUN'; dull what reflects, expose shorter, or "
-            "correct the radii"
+            f"poses off alike, by millimetres along the view: the standard deviations {hold}. Look at "
+            "'bricktrack overlay RUN'; dull what reflects, expose shorter, or correct the radii"
         ]
 
 

@@ -85,8 +85,8 @@ def words_on_unused_leds(observations: LedObservations, brick_model: BrickModel)
             f"{brick_model.led_names[k]}, used in {int(used[:, k].sum())} of {len(used)} frames ({told})"
         )
     return [
-        f"LEDs that hardly served: {'; '.join(named)}. They are dark or faint beside the others, covered, or "
-        "not where the layout has them. The others hold the poses, less surely"
+        f"LEDs that were hardly used: {'; '.join(named)}. They are dark or faint beside the others, covered, "
+        "or not where the layout has them. The others hold the poses, less surely"
     ]
 
 

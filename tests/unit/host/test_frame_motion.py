@@ -1,4 +1,4 @@
-"""How brick and twist move between the frames, against motions that are known."""
+"""How far a spline through frames may be trusted, against motions that are known."""
 
 import numpy as np
 import pytest

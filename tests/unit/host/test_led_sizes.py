@@ -42,14 +42,19 @@ def scene():
 @pytest.mark.parametrize("factor", [0.7, 0.9, 1.1])
 def test_lights_of_about_their_leds_size_are_passed_over(scene, factor):
     seen, track = scene
-    assert led_sizes(replace(seen, area_px2=factor * seen.area_px2), track, CAMERA, BRICK).words(BRICK) == []
+    assert (
+        led_sizes(replace(seen, area_px2=factor * seen.area_px2), track, CAMERA, BRICK).words(
+            BRICK, in_covariance=True
+        )
+        == []
+    )
 
 
 def test_lights_that_are_larger_are_named_with_how_much(scene):
     seen, track = scene
     large = replace(seen, area_px2=seen.area_px2 * [1, 1.4, 1, 1.45, 1, 1, 1])
     sizes = led_sizes(large, track, CAMERA, BRICK)
-    (words,) = sizes.words(BRICK)
+    (words,) = sizes.words(BRICK, in_covariance=True)
     assert "(m1 1.40, m3 1.45 times the area)" in words
     assert np.flatnonzero(sizes.sd_px).tolist() == [1, 3]
 
@@ -68,13 +73,16 @@ def test_two_discs_that_ran_together_have_their_middle_as_far_off_as_is_said():
 
 def test_an_unknown_profile_is_no_reason_to_doubt(scene):
     seen, track = scene
-    assert led_sizes(seen, track, CAMERA, replace(BRICK, led_profile=None)).words(BRICK) == []
+    assert (
+        led_sizes(seen, track, CAMERA, replace(BRICK, led_profile=None)).words(BRICK, in_covariance=True)
+        == []
+    )
 
 
 def test_lights_that_are_flagged_anyway_and_frames_without_a_pose_do_not_count(scene):
     seen, track = scene
     large = replace(seen, area_px2=seen.area_px2 * 1.5)
     merged = replace(large, led_flags=np.full((N, 7), int(LedFlag.MERGED)))
-    assert led_sizes(merged, track, CAMERA, BRICK).words(BRICK) == []
+    assert led_sizes(merged, track, CAMERA, BRICK).words(BRICK, in_covariance=True) == []
     lost = replace(track, t_camera_brick_mm=np.full((N, 3), np.nan))
-    assert led_sizes(large, lost, CAMERA, BRICK).words(BRICK) == []
+    assert led_sizes(large, lost, CAMERA, BRICK).words(BRICK, in_covariance=True) == []

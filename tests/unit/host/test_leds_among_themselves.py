@@ -23,7 +23,7 @@ def run():
     )
 
 
-def measured(run, residual_px):
+def measured(run, residual_px, *, is_used=None):
     """Return the run's arrays, of which only these are looked at, with such residuals."""
     leds = SeenLeds.of(run.observations, run.camera)
     track = solve_poses(run.observations, run.camera, run.brick)
@@ -31,7 +31,7 @@ def measured(run, residual_px):
     pictured = picture(leds, np.repeat(R[None], 3, 0), np.repeat(t_mm[None], 3, 0), run.camera, run.brick)
     m = len(leds.t_ns)
     fields = dict.fromkeys(LedArrays._fields, np.zeros(m)) | {
-        "use": np.ones(m, dtype=np.bool_),
+        "use": np.ones(m, dtype=np.bool_) if is_used is None else is_used(leds),
         "J": pictured.J_px,
         "cov_px2": np.broadcast_to(0.05**2 * np.eye(2), (m, 2, 2)),
         "residual_px": residual_px(leds, pictured),
@@ -87,6 +87,7 @@ def test_what_all_poses_hide_says_nothing_of_the_size(run):
     assert size_px(moved_px) < 0.02
 
 
-def test_a_run_without_four_leds_in_a_frame_says_nothing():
-    none = AmongThemselves(np.zeros((0, 14)), np.zeros(0), np.zeros(0))
+def test_a_run_without_four_leds_in_a_frame_says_nothing(run):
+    none = measured(run, lambda leds, _: np.ones((len(leds.led), 2)), is_used=lambda leds: leds.led < 3)
+    assert not len(none.value)
     np.testing.assert_array_equal(none.belief(np.ones((3, 1, 1)) * np.eye(14), np.zeros(14)), np.zeros(3))

@@ -101,7 +101,7 @@ def test_poses_are_freed_of_an_odd_led_and_say_so():
     assert rms_mm[1] < 0.3 * rms_mm[0]
 
 
-def test_an_led_that_hardly_served_is_named_with_the_reason():
+def test_an_led_that_was_hardly_used_is_named_with_the_reason():
     R, t = shaken(4)
     run = seen(R, t, off_px=0.0, seed=4)
     assert words_on_unused_leds(run, BRICK) == []

@@ -7,6 +7,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
+from bricktrack_common.errors import TrackingError
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import (
     Pictured,
@@ -118,7 +119,10 @@ def smooth_leds(
     n_leds = brick_model.n_leds
     errors = StandingErrors.before(first.run, lever_arm_m, n_leds)
     belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
-    sights, _ = _sights(_placeable(leds, first, settings), first, ray_model, brick_model)
+    placeable = _placeable(leds, first, settings)
+    if not len(placeable.t_ns):
+        raise TrackingError("the motion pose by pose is too unsure to say where any LED should be seen")
+    sights, _ = _sights(placeable, first, ray_model, brick_model)
     now, use = first, np.ones(len(sights.leds.t_ns), dtype=np.bool_)
     for i in range(_PASSES):
         done = _pass(sights, use, now, first, belief)
@@ -207,5 +211,6 @@ def _without_frames(run: Run) -> Run:
         R_seen=np.zeros((0, 3, 3)),
         p_seen_m=np.zeros((0, 3)),
         cov_seen=np.zeros((0, 6, 6)),
+        shared_seen=None,
         still_s=np.zeros(0),
     )

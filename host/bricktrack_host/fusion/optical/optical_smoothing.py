@@ -260,7 +260,13 @@ class _Smoothing:
         self._frame_ns, self._z, self._z_cov = frame_ns[good], z[good], z_cov[good]
         self._t_s = seconds_since(self._frame_ns, self._epoch_ns)
         self._jerk = _choose_jerk(self._t_s, self._z, self._z_cov, self._kicks(self._frame_ns))
-        self._common = settings.optical_common_share**2 * np.median(stated[good], axis=0)
+        # A frame's own matrix: medians of single elements would be no covariance.
+        size = np.log(np.diagonal(stated, axis1=1, axis2=2)).sum(axis=1)
+        median = int(np.flatnonzero(good)[np.argsort(size[good])[good.sum() // 2]])
+        shared = optical.shared_covariance
+        self._common = (
+            settings.optical_common_share**2 * stated[median] if shared is None else shared[seen][median]
+        )
 
     def _kicks(self, t_ns: IntArray) -> FloatArray:
         return np.zeros(len(t_ns)) if self._felt is None else self._felt.kicks_mmps(t_ns)

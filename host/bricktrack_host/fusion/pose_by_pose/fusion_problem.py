@@ -62,7 +62,7 @@ class Run:
         There, IMU time of the frames at which the camera's attitude was taken.
     gyro_gain, acc_gain : ndarray, shape (3, 3)
         Of the samples over the truth, as far as is known.
-    sensor_covariance : ndarray, shape (21, 21) or (42, 42)
+    sensor_covariance : ndarray, shape (21, 21) or (44, 44)
         Of what is left in them and in the lever arm, see `sensor_errors.SensorErrors`.
     """
 

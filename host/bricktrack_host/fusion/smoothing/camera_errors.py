@@ -97,7 +97,9 @@ class CameraWay:
         in_camera = np.einsum("kji,kj->ki", middle, felt)
         velocity = skew(felt) @ (0.5 * (turned[1:] + turned[:-1]))
         velocity[..., ACC] = -np.einsum("kri,km->krim", middle, in_camera).reshape(-1, 3, 9)
-        force = np.divide(felt, dt[:, None], out=np.zeros_like(felt), where=dt[:, None] > 0)
+        n_steps = len(R_still_camera) - 1  # those of other runs of a batch are more
+        force = felt / np.where(dt > 0, dt, 1.0)[:, None]
+        force[n_steps:] = force[n_steps - 1]
         velocity[..., DELAY] = _over_step(force)
         velocity[..., RATE] = velocity[..., DELAY] * 0.5 * (since_mid[1:] + since_mid[:-1])
         return cls(np.concatenate([[0.0], np.cumsum(dt)]), R, turned, velocity)
