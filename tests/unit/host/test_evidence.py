@@ -155,3 +155,4 @@ def test_the_area_of_one_led_tells_as_much_as_those_of_a_picture_of_one():
         [np.exp(-0.5 * (off / sd) ** 2) / (np.sqrt(2 * np.pi) * sd) for sd in (0.03, 0.1, 0.2)], axis=0
     )
     np.testing.assert_allclose(log_area_ratio(off), np.log(0.95 * own * np.log(81.0) + 0.05))
+    assert np.isnan(log_area_ratio(np.array([np.nan])))  # and no warning of it

@@ -300,6 +300,7 @@ def log_area_ratio(log_ratio: FloatArray) -> FloatArray:
     Parameters
     ----------
     log_ratio : ndarray
-        Logarithm of the area over the predicted one, less what all LEDs of the picture have in common.
+        Logarithm of the area over the predicted one, less what all LEDs of the picture have in common; NaN
+        where one is not known, and in what is returned.
     """
-    return np.asarray(np.logaddexp.reduce(_of_area(log_ratio), axis=-1) - np.log(len(_AREA_SDS)))
+    return np.asarray(np.log(np.exp(_of_area(log_ratio)).mean(axis=-1)))
