@@ -6,6 +6,8 @@ Covariances are of the error ``[dtheta, dt]``: ``R_true = R @ Exp(dtheta)`` in r
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from bricktrack_common.arrays import FloatArray, IntArray
 
 
@@ -116,3 +118,12 @@ class FusedTrack:
     v_camera_mmps: FloatArray
     covariance: FloatArray
     flags: IntArray
+
+
+def median_frame(covariance: FloatArray) -> int:
+    """Return the frame whose covariance, of shape (n, 6, 6), is of the middle size: one that stands for all.
+
+    Its own matrix can be used: medians of single elements would be no covariance.
+    """
+    size = np.log(np.diagonal(covariance, axis1=1, axis2=2)).sum(axis=1)
+    return int(np.argsort(size)[len(size) // 2])

@@ -21,7 +21,7 @@ from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.optical.inertial_hint import Felt, InertialHint
 from bricktrack_host.fusion.optical.pose_neighbours import good_frames, interpolated, pose_jumps
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.tracks import FusedTrack, OpticalTrack
+from bricktrack_host.tracks import FusedTrack, OpticalTrack, median_frame
 
 _MIN_POSITION_SD_MM = 2e-3
 _MAX_TURN_RAD = 2.5  # rotation vectors from the middle attitude stay smooth below pi
@@ -260,9 +260,7 @@ class _Smoothing:
         self._frame_ns, self._z, self._z_cov = frame_ns[good], z[good], z_cov[good]
         self._t_s = seconds_since(self._frame_ns, self._epoch_ns)
         self._jerk = _choose_jerk(self._t_s, self._z, self._z_cov, self._kicks(self._frame_ns))
-        # A frame's own matrix: medians of single elements would be no covariance.
-        size = np.log(np.diagonal(stated, axis1=1, axis2=2)).sum(axis=1)
-        median = int(np.flatnonzero(good)[np.argsort(size[good])[good.sum() // 2]])
+        median = np.flatnonzero(good)[median_frame(stated[good])]
         shared = optical.shared_covariance
         self._common = (
             settings.optical_common_share**2 * stated[median] if shared is None else shared[seen][median]

@@ -27,7 +27,7 @@ from bricktrack_host.fusion.smoothing.smoother import (
     observe,
 )
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.tracks import FusedTrack
+from bricktrack_host.tracks import FusedTrack, median_frame
 
 # The velocity comes from poses at the same stamps: its own share that is unsure, in any direction.
 _UNSURE_VELOCITY = 0.3
@@ -211,9 +211,7 @@ def common_part(run: Run, scale: FloatArray, share: float) -> FloatArray:
     share : float
         Of the stated sd that is in common in any case.
     """
-    # A frame's own matrix: medians of single elements would be no covariance.
-    size = np.log(np.diagonal(run.cov_seen, axis1=1, axis2=2)).sum(axis=1)
-    median = np.argsort(size)[len(size) // 2]
+    median = median_frame(run.cov_seen)
     if run.shared_seen is not None:
         return np.asarray(run.shared_seen[median])
     share_at = np.repeat(np.sqrt(np.maximum((share * scale) ** 2, 1.0 - scale**2)), 3)
