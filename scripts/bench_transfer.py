@@ -29,8 +29,9 @@ sys.path.insert(0, str(HERE.parent / "tests" / "support"))
 from light_unit import LightUnit, make_keys  # noqa: E402 (the tests' support is no package)
 from run_folders import make_run  # noqa: E402
 
+from bricktrack_host.transfer.chunk_reads import CHUNK_BYTES  # noqa: E402
 from bricktrack_host.transfer.run_transfer import pull_run  # noqa: E402
-from bricktrack_host.transfer.unit_client import CHUNK_BYTES, UnitClient  # noqa: E402
+from bricktrack_host.transfer.unit_client import UnitClient  # noqa: E402
 
 MB = 1_000_000
 RUN = "light_0001"

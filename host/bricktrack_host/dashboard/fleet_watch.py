@@ -10,7 +10,7 @@ from bricktrack_common.errors import BricktrackError, UnitError
 from bricktrack_host.dashboard.unit_view import UnitView, view_of
 from bricktrack_host.transfer.contact import MAX_ASKED_AT_ONCE, Dialer
 from bricktrack_host.transfer.fleet_config import UnitConfig
-from bricktrack_host.transfer.unit_client import Stopped
+from bricktrack_host.transfer.unit_connection import Stopped
 
 EVERY_S = 0.6
 """Between two questions to a unit; a change is on the page within a second."""

@@ -52,7 +52,7 @@ class Dialer:
     own_keys : KeyPair, optional
         This host's, for units that have keys.
     stop : threading.Event, optional
-        Once it is set, waiting for a unit ends with `unit_client.Stopped`.
+        Once it is set, waiting for a unit ends with `unit_connection.Stopped`.
     """
 
     timeout_s: float = 5.0

@@ -26,7 +26,7 @@ from bricktrack_common.checksums import crc32
 from bricktrack_common.errors import StorageError
 from bricktrack_common.wire_messages import RunDescription
 from bricktrack_host.durable_files import rename_durably, sync_folder, write_durably
-from bricktrack_host.transfer.unit_client import VerifiedChunk
+from bricktrack_host.transfer.chunk_reads import VerifiedChunk
 
 JOURNAL_NAME = ".journal.jsonl"  # begins with a dot, which no file of a run may
 JOURNAL_VERSION = 1

@@ -20,7 +20,8 @@ from bricktrack_host.transfer.contact import Contact, Dialer, ask_units
 from bricktrack_host.transfer.fleet_config import UnitConfig
 from bricktrack_host.transfer.pull_progress import PullProgress, QuietProgress
 from bricktrack_host.transfer.run_transfer import PulledRun, pull_run
-from bricktrack_host.transfer.unit_client import Stopped, UnitClient
+from bricktrack_host.transfer.unit_client import UnitClient
+from bricktrack_host.transfer.unit_connection import Stopped
 
 __all__ = ["MAX_WORKERS", "PullSettings", "PulledRun", "UnitPull", "pull_fleet", "pull_unit"]
 

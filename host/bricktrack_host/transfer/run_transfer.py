@@ -26,9 +26,11 @@ from bricktrack_common.errors import (
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_common.wire_messages import FileSummary, RunDescription
 from bricktrack_host.durable_files import rename_durably, storage_errors
+from bricktrack_host.transfer.chunk_reads import CHUNK_BYTES
 from bricktrack_host.transfer.part_folder import PartFolder
 from bricktrack_host.transfer.pull_progress import PullProgress, QuietProgress
-from bricktrack_host.transfer.unit_client import CHUNK_BYTES, Stopped, UnitClient
+from bricktrack_host.transfer.unit_client import UnitClient
+from bricktrack_host.transfer.unit_connection import Stopped
 
 _RESERVED_SUFFIXES = (".part", ".partial")
 _FREE_MARGIN_BYTES = 16 * 1024 * 1024

@@ -10,8 +10,8 @@ import pytest
 
 from bricktrack_common.wire_messages import FileSummary, RunDescription
 from bricktrack_host.transfer import part_folder
+from bricktrack_host.transfer.chunk_reads import VerifiedChunk
 from bricktrack_host.transfer.part_folder import JOURNAL_NAME, PartFolder
-from bricktrack_host.transfer.unit_client import VerifiedChunk
 
 DATA = random.Random(2).randbytes(1_000_003)
 CHUNK = 64 * 1024

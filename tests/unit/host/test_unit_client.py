@@ -25,7 +25,8 @@ from bricktrack_common.wire_messages import (
     TakeStill,
     encode_message,
 )
-from bricktrack_host.transfer.unit_client import Stopped, UnitClient
+from bricktrack_host.transfer.unit_client import UnitClient
+from bricktrack_host.transfer.unit_connection import Stopped
 
 RUN = "fake_0001_shake"
 
