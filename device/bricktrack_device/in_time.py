@@ -14,6 +14,10 @@ _GIVE_UP_S = 5.0
 T = TypeVar("T")
 
 
+class HangsError(HardwareError):
+    """A call did not return in time; it is left to its thread."""
+
+
 def in_time(what: str, call: Callable[[], T], timeout_s: float, *, beat: Callable[[], None]) -> T:
     """Return what a call returns; one that hangs is left to its thread.
 
@@ -26,7 +30,7 @@ def in_time(what: str, call: Callable[[], T], timeout_s: float, *, beat: Callabl
 
     Raises
     ------
-    HardwareError
+    HangsError
         If the call does not return in time.
     Exception
         What the call raised.
@@ -53,5 +57,5 @@ def in_time(what: str, call: Callable[[], T], timeout_s: float, *, beat: Callabl
     if errors:
         raise errors[0]
     if not results:
-        raise HardwareError(f"{what} hangs: no answer within {timeout_s:g} s. Restart bricktrackd")
+        raise HangsError(f"{what} hangs: no answer within {timeout_s:g} s. Restart bricktrackd")
     return results[0]

@@ -14,10 +14,9 @@ from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import BricktrackError, HardwareError
 from bricktrack_common.run_manifest import CameraSection
 from bricktrack_common.wire_messages import MAX_STILL_BYTES, StillEncoding, StillImage
-from bricktrack_device.capture.ring import FrameRing
+from bricktrack_device.capture.camera_stream import CameraStream
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.in_time import in_time
-from bricktrack_device.interfaces import Camera, Rig, Still
+from bricktrack_device.interfaces import Rig, Still
 from bricktrack_device.refusals import RequestRefusedError
 
 if TYPE_CHECKING:
@@ -25,10 +24,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-CAMERA_START_TIMEOUT_S = 30.0
-CAMERA_STOP_TIMEOUT_S = 5.0
 STILL_TIMEOUT_S = 5.0
-_RING_S = 1.0
+_RING_NS = 1_000_000_000
 _JPEG_QUALITY = 2  # FFmpeg's scale, 2 is the best
 _POLL_S = 0.01
 
@@ -51,7 +48,14 @@ class TakenStill:
     taken_ns: int
 
 
-def take_still(config: DeviceConfig, rig: Rig, *, lit: bool, beat: Callable[[], None]) -> TakenStill:
+def take_still(
+    config: DeviceConfig,
+    rig: Rig,
+    *,
+    lit: bool,
+    beat: Callable[[], None],
+    note_lost_camera: Callable[[str], None] = lambda words: None,
+) -> TakenStill:
     """Start the camera as a run would, take a picture, and stop it again.
 
     Parameters
@@ -60,6 +64,8 @@ def take_still(config: DeviceConfig, rig: Rig, *, lit: bool, beat: Callable[[], 
         Switch the LEDs on for it, where they hang on pins.
     beat : callable
         Called while waiting; raises to give up.
+    note_lost_camera : callable
+        Hears why only a new start of the daemon gives the camera back, or ``""``.
 
     Raises
     ------
@@ -72,36 +78,36 @@ def take_still(config: DeviceConfig, rig: Rig, *, lit: bool, beat: Callable[[], 
         with nullcontext() if leds is None else leds:
             if leds is not None:
                 leds.switch(lit)
-            return _with_camera(rig, lit=None if leds is None else lit, beat=beat)
+            stream = CameraStream(rig.open_camera, _RING_NS, beat=beat)
+            try:
+                return _picture_from(stream, lit=None if leds is None else lit, beat=beat)
+            finally:
+                _stop(stream)
+                note_lost_camera(stream.lost)
     except HardwareError as e:
         raise RequestRefusedError("not-ready", f"no picture: {e}") from e
 
 
-def _with_camera(rig: Rig, *, lit: bool | None, beat: Callable[[], None]) -> TakenStill:
-    camera = rig.open_camera()
-    ring = FrameRing(round(_RING_S * 1e9))
-    try:
-        section = in_time("start", lambda: camera.start(ring), CAMERA_START_TIMEOUT_S, beat=beat)
-        deadline = time.monotonic() + STILL_TIMEOUT_S
-        while True:
-            beat()
-            taken_ns = monotonic_ns()
-            still = in_time("still", camera.still, STILL_TIMEOUT_S, beat=beat)
-            if still is not None:
-                return TakenStill(still, section, lit, taken_ns)
-            if time.monotonic() > deadline:
-                raise HardwareError(
-                    f"{section.model} gave none within {STILL_TIMEOUT_S:g} s ({ring.n_packets} pictures were "
-                    "encoded). Check the camera's cable, then run 'bricktrackd check'"
-                )
-            time.sleep(_POLL_S)
-    finally:
-        _stop(camera)
+def _picture_from(stream: CameraStream, *, lit: bool | None, beat: Callable[[], None]) -> TakenStill:
+    section = stream.start()
+    deadline = time.monotonic() + STILL_TIMEOUT_S
+    while True:
+        beat()
+        taken_ns = monotonic_ns()
+        still = stream.still()
+        if still is not None:
+            return TakenStill(still, section, lit, taken_ns)
+        if time.monotonic() > deadline:
+            raise HardwareError(
+                f"{section.model} gave none within {STILL_TIMEOUT_S:g} s ({stream.ring.n_packets} pictures "
+                "were encoded). Check the camera's cable, then run 'bricktrackd check'"
+            )
+        time.sleep(_POLL_S)
 
 
-def _stop(camera: Camera) -> None:
+def _stop(stream: CameraStream) -> None:
     try:
-        in_time("stop", camera.stop, CAMERA_STOP_TIMEOUT_S, beat=lambda: None)
+        stream.stop()
     except (BricktrackError, OSError) as e:
         logger.warning("camera: %s", e)
 

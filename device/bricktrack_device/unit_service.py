@@ -132,7 +132,13 @@ class UnitService:
     # In the recorder's thread, while nothing is recorded
 
     def _still(self, request: TakeStill, answer: Answer) -> None:
-        taken = take_still(self._config, self._rig, lit=request.lit, beat=self._recorder.beat)
+        taken = take_still(
+            self._config,
+            self._rig,
+            lit=request.lit,
+            beat=self._recorder.beat,
+            note_lost_camera=self._recorder.note_lost_camera,
+        )
         answer(*encode_still(taken, request.encoding, simulated=self._rig.simulated))
 
     def _configure(self, request: Configure, answer: Answer) -> None:

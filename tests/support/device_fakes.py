@@ -38,6 +38,7 @@ class FakeBus:
     chip_id: int = 0xA0
     present: bool = True
     hang_after: int | None = None
+    hang_s: float = 3600.0
     exit_after: int | None = None
     fail_every: int | None = None
     reset_after: int | None = None
@@ -103,8 +104,8 @@ class FakeBus:
         self._answer(address)
         if register == 0x08 and n_bytes == 46:
             self.n_bursts += 1
-            if self.hang_after is not None and self.n_bursts > self.hang_after:
-                time.sleep(3600)
+            if self.hang_after is not None and self.n_bursts == self.hang_after + 1:
+                time.sleep(self.hang_s)
             if self.exit_after is not None and self.n_bursts > self.exit_after:
                 os._exit(7)
             if self.fail_every is not None and self.n_bursts % self.fail_every == 0:
@@ -129,6 +130,7 @@ class FakeBusOpener:
     present: bool = True
     hang_at_opening: bool = False
     hang_after: int | None = None
+    hang_s: float = 3600.0
     exit_after: int | None = None
     fail_every: int | None = None
     reset_after: int | None = None
@@ -139,7 +141,7 @@ class FakeBusOpener:
         # Called in the sampler's process: there the driver need not wait 0.7 s for a table of registers.
         adafruit_bno055.time = SimpleNamespace(sleep=lambda seconds: None)
         return FakeBus(
-            present=self.present, hang_after=self.hang_after, exit_after=self.exit_after,
+            present=self.present, hang_after=self.hang_after, hang_s=self.hang_s, exit_after=self.exit_after,
             fail_every=self.fail_every, reset_after=self.reset_after,
         )  # fmt: skip
 

@@ -27,7 +27,7 @@ from bricktrack_common.run_manifest import (
     write_manifest,
 )
 from bricktrack_common.wire_messages import Armed, Disarmed
-from bricktrack_device.capture.recorder import RecorderStatus
+from bricktrack_device.capture.recorder_status import RecorderStatus
 from bricktrack_device.config import DeviceConfig, ServerTable, StorageTable, UnitTable
 from bricktrack_device.network.file_server import FileServer
 from bricktrack_device.network.unit_keys import UnitKeys

@@ -4,26 +4,25 @@ Everything that changes the state happens in this thread; commands come in throu
 through the callback that they bring.
 """
 
-import errno
 import logging
 import queue
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from bricktrack_common.clocks import check_monotonic_is_boottime, monotonic_ns, read_clock_triplet
 from bricktrack_common.errors import BricktrackError, StorageError
-from bricktrack_common.wire_messages import (
-    Armed,
-    DaemonState,
-    Disarmed,
-    ErrorCode,
-    ImuStatus,
-    Refusal,
-    Reply,
+from bricktrack_common.wire_messages import Armed, DaemonState, Disarmed, Refusal
+from bricktrack_device.capture.commands import (
+    Answer,
+    ArmCommand,
+    Command,
+    DisarmCommand,
+    OtherWork,
+    refusal_of,
 )
-from bricktrack_device.capture.recording import Recording, save
+from bricktrack_device.capture.kept_run import KeptRun
+from bricktrack_device.capture.recorder_status import RecorderStatus, status_of
 from bricktrack_device.capture.retention import make_room
 from bricktrack_device.capture.room import check_room, disk_needed_bytes
 from bricktrack_device.capture.run_light import RunLight
@@ -33,62 +32,12 @@ from bricktrack_device.config import DeviceConfig
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.storage.run_store import RunStore
-from bricktrack_device.storage.run_writer import RunWriter
 
 logger = logging.getLogger(__name__)
-
-Answer = Callable[[Reply], None]
 
 _TICK_S = 0.02
 _IDLE_TICK_S = 0.2
 _RETRY_S = 10.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Arm:
-    label: str
-    duration_s: float | None
-    answer: Answer
-
-
-@dataclass(frozen=True, slots=True)
-class _Disarm:
-    answer: Answer
-
-
-@dataclass(frozen=True, slots=True)
-class _Do:
-    doing: str
-    work: Callable[[], None]
-    answer: Answer
-
-
-@dataclass(frozen=True, slots=True)
-class _Wake:
-    pass
-
-
-@dataclass(frozen=True, slots=True)
-class _Unsaved:
-    recording: Recording
-    writer: RunWriter
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderStatus:
-    """How the recorder is, at one moment; see `bricktrack_common.wire_messages.StatusReply`."""
-
-    state: DaemonState
-    reason: str
-    run_id: str
-    frames: int
-    frame_age_ms: float | None
-    imus: list[ImuStatus]
-    edges: int
-    line_is_high: bool | None
-    last_error: str
-    disk_needed_bytes: int
-    auto_arm: bool
 
 
 class _StoppingError(BricktrackError):
@@ -110,11 +59,12 @@ class Recorder:
         self._rig = rig
         self._store = store
         self._machine = StateMachine()
-        self._inbox: queue.SimpleQueue[_Arm | _Disarm | _Do | _Wake] = queue.SimpleQueue()
+        # None only wakes the thread up.
+        self._inbox: queue.SimpleQueue[Command | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._stopping = threading.Event()
         self._session: Session | None = None
-        self._unsaved: _Unsaved | None = None
+        self._kept = KeptRun(store, rig)
         self._auto_arm = config.recording.auto_arm
         self._try_again_at = 0.0
         self._last_error = ""
@@ -132,17 +82,17 @@ class Recorder:
     def stop(self) -> None:
         """End: a recording under way is saved as far as it got, and marked. Returns when that is done."""
         self._stopping.set()
-        self._inbox.put(_Wake())
+        self._inbox.put(None)
         if self._thread.ident is not None:
             self._thread.join()
 
     def arm(self, label: str, duration_s: float | None, answer: Answer) -> None:
         """Ask to arm; answered with `Armed` when the unit is ready, or a `Refusal`."""
-        self._inbox.put(_Arm(label, duration_s, answer))
+        self._inbox.put(ArmCommand(label, duration_s, answer))
 
     def disarm(self, answer: Answer) -> None:
         """Ask to go back to idle, or to leave a fault; answered with `Disarmed` or a `Refusal`."""
-        self._inbox.put(_Disarm(answer))
+        self._inbox.put(DisarmCommand(answer))
 
     def do_when_idle(self, doing: str, work: Callable[[], None], answer: Answer) -> None:
         """Ask to do other work with the unit's sensors, in this thread, while nothing is recorded.
@@ -150,7 +100,7 @@ class Recorder:
         ``work`` calls `beat` while it waits and answers by itself; ``answer`` gets the `Refusal` if the unit
         is armed, records or saves, or the work raises. ``doing`` says in the status what is going on.
         """
-        self._inbox.put(_Do(doing, work, answer))
+        self._inbox.put(OtherWork(doing, work, answer))
 
     @property
     def state(self) -> DaemonState:
@@ -164,18 +114,10 @@ class Recorder:
 
     def status(self) -> RecorderStatus:
         """Return how things are."""
-        session = self._session
-        newest_us = session.ring.newest_us if session else None
-        trigger = session.trigger if session else None
-        return RecorderStatus(
-            state=self.state,
-            reason=self._machine.reason or self._doing or self._waiting_words(session),
-            run_id=session.run_id if session else "",
-            frames=session.ring.n_packets if session else 0,
-            frame_age_ms=None if newest_us is None else (monotonic_ns() - newest_us * 1000) / 1e6,
-            imus=[i.status() for i in list(session.imus)] if session else [],
-            edges=trigger.n_edges if trigger else 0,
-            line_is_high=trigger.line_is_high if trigger else None,
+        return status_of(
+            self._session,
+            self.state,
+            self._machine.reason or self._doing,
             last_error=self._last_error,
             disk_needed_bytes=disk_needed_bytes(self._config),
             auto_arm=self._auto_arm,
@@ -184,30 +126,27 @@ class Recorder:
     @property
     def restart_reason(self) -> str:
         """Why only a restart of the process helps, in words; empty while it does not, or holds a run."""
-        return "" if self._session or self._unsaved else self._lost_camera
-
-    @staticmethod
-    def _waiting_words(session: Session | None) -> str:
-        if session is None or session.trigger is None:
-            return ""
-        return "; ".join(w for w in (session.trigger.waiting_words(), *session.missing) if w)
+        return "" if self._session or self._kept.run_id else self._lost_camera
 
     # The thread
 
     def _run(self) -> None:
-        self._light.put_out_leftovers()
+        try:
+            self._light.put_out_leftovers()
+        except Exception:
+            logger.exception("a bug in putting the LEDs out")
         while not self._stopping.is_set():
             self._last_beat = time.monotonic()
             try:
                 command = self._inbox.get(timeout=_TICK_S if self._session else _IDLE_TICK_S)
             except queue.Empty:
-                command = _Wake()
+                command = None
             try:
-                self._obey(command)
+                if command is not None:
+                    self._obey(command)
                 self._go_on()
-            except Exception as e:
-                logger.exception("a bug in the recorder")
-                self._save_what_there_is(f"internal error: {type(e).__name__}: {e}")
+            except Exception as e:  # noqa: BLE001  logged there, or noted in the run under way
+                self._go_on_after(e)
         self._end()
 
     def beat(self) -> None:
@@ -216,28 +155,21 @@ class Recorder:
         if self._stopping.is_set():
             raise _StoppingError("the daemon is stopping")
 
-    def _obey(self, command: _Arm | _Disarm | _Do | _Wake) -> None:
-        if isinstance(command, _Wake):
-            return
+    def _obey(self, command: Command) -> None:
         try:
-            if isinstance(command, _Arm):
+            if isinstance(command, ArmCommand):
                 session = self._arm(command.label, command.duration_s)
                 self._auto_arm = self._config.recording.auto_arm
                 command.answer(Armed(run_id=session.run_id, missing=[m[:2000] for m in session.missing]))
-            elif isinstance(command, _Disarm):
+            elif isinstance(command, DisarmCommand):
                 self._disarm()
                 command.answer(Disarmed())
             else:
                 self._do(command)
-        except RequestRefusedError as e:
-            command.answer(Refusal(code=e.code, message=str(e)[:2000]))
-        except StorageError as e:
-            code: ErrorCode = "no-space" if e.errno == errno.ENOSPC else "not-ready"
-            command.answer(Refusal(code=code, message=str(e)[:2000]))
         except BricktrackError as e:
-            command.answer(Refusal(code="not-ready", message=str(e)[:2000]))
+            command.answer(refusal_of(e))
         except Exception as e:
-            command.answer(Refusal(code="internal", message=f"{type(e).__name__}: {e}"[:2000]))
+            command.answer(refusal_of(e))
             raise
 
     def _go_on(self) -> None:
@@ -255,9 +187,9 @@ class Recorder:
                     self._fail(f"lost while armed: {session.lost_required}. The unit will arm itself again")
             elif self.state == "recording" and session.is_over(monotonic_ns()):
                 self._finish()
-        elif self.state == "fault" and self._unsaved and time.monotonic() >= self._try_again_at:
+        elif self.state == "fault" and self._kept.run_id and time.monotonic() >= self._try_again_at:
             self._try_again_at = time.monotonic() + _RETRY_S
-            if self._store.free_bytes() > self._unsaved.recording.n_bytes + (1 << 20):
+            if self._kept.has_room():
                 self._save_again()
         elif self.state == "fault" and self._auto_arm and time.monotonic() >= self._try_again_at:
             self._change("disarm")
@@ -289,7 +221,7 @@ class Recorder:
             )
             self._session = session
             try:
-                session.open(lambda: self._inbox.put(_Wake()))
+                session.open(lambda: self._inbox.put(None))
             except BaseException:
                 self._close_session()
                 self._light.put_out()
@@ -301,12 +233,11 @@ class Recorder:
         return session
 
     def _disarm(self) -> None:
-        if self.state == "fault" and self._unsaved is not None:
+        if self.state == "fault" and self._kept.run_id:
             self._save_again()
-            if self._unsaved is not None:
+            if self._kept.run_id:
                 raise RequestRefusedError(
-                    "no-space",
-                    f"run {self._unsaved.recording.run_id} is still only in memory: {self._machine.reason}",
+                    "no-space", f"run {self._kept.run_id} is still only in memory: {self._machine.reason}"
                 )
         self._auto_arm = False
         if self.state == "idle":
@@ -315,7 +246,7 @@ class Recorder:
         self._close_session()
         self._change("disarm")
 
-    def _do(self, command: _Do) -> None:
+    def _do(self, command: OtherWork) -> None:
         if self.state not in ("idle", "fault"):
             raise RequestRefusedError(
                 "busy", f"the unit is {self.state}; {command.doing} waits until it is idle"
@@ -331,6 +262,10 @@ class Recorder:
         if config.recording.auto_arm != self._config.recording.auto_arm:
             self._auto_arm = config.recording.auto_arm
         self._config = config
+
+    def note_lost_camera(self, words: str) -> None:
+        """Hear why only a new start of the daemon gives the camera back; ``""`` says that it is not so."""
+        self._lost_camera = self._lost_camera or words
 
     def _must_allow(self, cause: Cause) -> None:
         if self._machine.allows(cause):
@@ -352,46 +287,38 @@ class Recorder:
         session = self._session
         if session is None:
             return
-        recording = session.collect(interrupted=interrupted)
+        # Held from here on, whatever the sensors do when they are let go.
+        self._kept.keep(session.collect(interrupted=interrupted))
         ended = time.monotonic()
         self._change("stop" if interrupted else "window-over")
         self._close_session()
         closed = time.monotonic()
-        self._unsaved = _Unsaved(recording, self._store.open_writer(recording.run_id))
-        if self._save_unsaved():
+        if self._save_kept():
             logger.info(
                 "%s: saved %.2f s after the recording ended (%.2f s of it to stop the sensors)",
-                recording.run_id, time.monotonic() - ended, closed - ended,
+                session.run_id, time.monotonic() - ended, closed - ended,
             )  # fmt: skip
 
     def _save_again(self) -> None:
         self._change("save-again")
-        self._save_unsaved()
+        self._save_kept()
 
-    def _save_unsaved(self) -> bool:
-        unsaved = self._unsaved
-        if unsaved is None:
-            return False
-        start_ns, end_ns = unsaved.recording.truth_window_ns
+    def _save_kept(self) -> bool:
+        """Save the run that is held; go to fault, and hold it, where the card does not take it."""
         try:
-            save(
-                unsaved.recording,
-                unsaved.writer,
-                lambda folder: self._rig.write_truth(folder, start_ns=start_ns, end_ns=end_ns),
-            )
+            saved = self._kept.save()
         except StorageError as e:
             self._try_again_at = time.monotonic() + _RETRY_S
             reason = f"{e}. The run is kept in memory and saved when that works again"
             self._note_error(reason)
             self._change("save-failed", reason=reason)
             return False
-        self._unsaved = None
         self._try_again_at = 0.0
-        self._change("saved", run_id=unsaved.recording.run_id)
-        if unsaved.recording.missing:
+        self._change("saved", run_id=saved.run_id)
+        if saved.missing:
             logger.warning(
                 "%s: %d things are missing or wrong, as its manifest says; the last: %s",
-                unsaved.recording.run_id, len(unsaved.recording.missing), unsaved.recording.missing[-1],
+                saved.run_id, len(saved.missing), saved.missing[-1],
             )  # fmt: skip
         return True
 
@@ -404,30 +331,36 @@ class Recorder:
             elif self.state == "armed":
                 self._close_session()
                 self._change("stop")
-            elif self._unsaved is not None:
+            elif self._kept.run_id:
                 self._save_again()
         except Exception:
             logger.exception("a bug in the recorder while it ends")
         finally:
             self._close_session()
             self._light.put_out()
-        if self._unsaved is not None:
-            logger.error(
-                "%s: lost from memory; its folder holds what was saved", self._unsaved.recording.run_id
-            )
+        if self._kept.run_id:
+            logger.error("%s: lost from memory; its folder holds what was saved", self._kept.run_id)
         while not self._inbox.empty():
             command = self._inbox.get()
-            if not isinstance(command, _Wake):
+            if command is not None:
                 command.answer(Refusal(code="not-ready", message="the daemon is stopping"))
 
-    def _save_what_there_is(self, reason: str) -> None:
-        """Go to fault after a bug, but not before a recording under way is on the card."""
-        if self.state == "recording":
+    def _go_on_after(self, bug: Exception) -> None:
+        """Go to fault after a bug, but not before a recording under way has ended and is on the card."""
+        words = f"internal error: {type(bug).__name__}: {bug}"
+        session = self._session
+        if self.state == "recording" and session is not None:
+            if session.note_bug(words):
+                logger.error("%s: a bug; the recording goes on", session.run_id, exc_info=bug)
+            if not session.is_surely_over(monotonic_ns()):
+                return  # the sensors stream without this thread
             try:
-                self._finish(interrupted=reason)
+                self._finish()
             except Exception:
                 logger.exception("a second bug, while the recording was saved")
-        self._fail(reason)
+        else:
+            logger.error("a bug in the recorder", exc_info=bug)
+        self._fail(words)
 
     def _fail(self, reason: str) -> None:
         """Go to fault from wherever the unit is."""
@@ -440,7 +373,7 @@ class Recorder:
         session, self._session = self._session, None
         if session is not None:
             session.close()
-            self._lost_camera = self._lost_camera or session.lost_camera
+            self.note_lost_camera(session.camera.lost)
 
     def _change(self, cause: Cause, *, reason: str = "", run_id: str = "") -> None:
         change = self._machine.change(cause, reason=reason)

@@ -6,33 +6,29 @@ One sensor failing stops no other: it is noted in words, and the run says what i
 import logging
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from functools import partial
 from typing import TypeVar
 
 from bricktrack_common.clocks import ClockTriplet, monotonic_ns, read_clock_triplet
 from bricktrack_common.errors import BricktrackError, HardwareError
-from bricktrack_common.run_manifest import CameraSection, ClocksSection
+from bricktrack_common.run_manifest import ClocksSection, WaveSection
+from bricktrack_device.capture.camera_stream import CameraStream
 from bricktrack_device.capture.edge_report import judge_edges
 from bricktrack_device.capture.recording import ImuRecording, Recording, RunLog
-from bricktrack_device.capture.ring import RING_SLACK_S, FrameRing, VideoCut, cut_video
+from bricktrack_device.capture.ring import RING_SLACK_S
 from bricktrack_device.capture.run_light import RunLight
-from bricktrack_device.capture.trigger import Trigger
+from bricktrack_device.capture.trigger import EdgeTrain, Trigger
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.in_time import in_time
 from bricktrack_device.inertial.imu_reader import ImuReader
-from bricktrack_device.interfaces import Camera, Rig
+from bricktrack_device.interfaces import Rig
 from bricktrack_device.refusals import RequestRefusedError
 
 logger = logging.getLogger(__name__)
 
-CAMERA_START_TIMEOUT_S = 30.0
-CAMERA_STOP_TIMEOUT_S = 5.0
-FIRST_KEYFRAME_TIMEOUT_S = 10.0
 LATE_FRAMES_GRACE_S = 1.0
 """How long after the window's end the last pictures may still come out of the encoder."""
 LATE_EDGES_GRACE_NS = 100_000_000
 """How long after the window's end edges that were stamped within it may still be reported."""
-_SILENT_CAMERA_NS = 1_000_000_000
 _STUCK_HIGH_NS = 5_000_000_000
 _POLL_S = 0.01
 
@@ -75,16 +71,10 @@ class Session:
         self._light = light
         self._beat = beat
         span_s = config.span_s(duration_s) + RING_SLACK_S
-        self.ring = FrameRing(round((span_s + config.camera.iperiod / config.camera.frame_rate_hz) * 1e9))
+        keyframe_s = config.camera.iperiod / config.camera.frame_rate_hz
+        self.camera = CameraStream(rig.open_camera, round((span_s + keyframe_s) * 1e9), beat=beat)
         self._imu_span_s = span_s
-        self._camera: Camera | None = None
-        self._camera_section: CameraSection | None = None
-        self._camera_problem = ""
-        self._camera_words_told = ""
-        self.lost_camera = ""
         self.imus: list[ImuReader] = []
-        self._imu_problems_told: set[str] = set()
-        self._imu_resets_told: set[str] = set()
         self.trigger: Trigger | None = None
         self._line_told = False
         self._t_armed_ns = 0
@@ -117,7 +107,6 @@ class Session:
         try:
             self._start_camera()
         except BricktrackError as e:
-            self._camera_problem = str(e)
             if self._config.camera.required:
                 raise RequestRefusedError("not-ready", f"camera: {e}") from e
             self._note_missing(f"camera: {e}")
@@ -142,20 +131,9 @@ class Session:
             self.log.add("leds lit", words=self._light.words)
 
     def _start_camera(self) -> None:
-        camera = self._camera = self._rig.open_camera()
-        section = self._in_time("start", lambda: camera.start(self.ring), CAMERA_START_TIMEOUT_S)
-        self._camera_section = section
+        section = self.camera.start()
         self.log.add("camera started", model=section.model, mode=section.mode.name, encoder=section.encoder)
-        deadline = time.monotonic() + FIRST_KEYFRAME_TIMEOUT_S
-        while self.ring.first_keyframe_us is None:
-            self._beat()
-            if time.monotonic() > deadline:
-                raise HardwareError(
-                    f"no keyframe came within {FIRST_KEYFRAME_TIMEOUT_S:g} s of starting "
-                    f"({self.ring.n_packets} pictures came). Check the camera's cable, then run "
-                    "'bricktrackd check'"
-                )
-            time.sleep(_POLL_S)
+        self.camera.wait_for_keyframe()
 
     def _wait_for_imus(self) -> None:
         while any(not i.is_ready and not i.problem for i in self.imus):
@@ -164,12 +142,11 @@ class Session:
                 reader.poll()
             time.sleep(_POLL_S)
         for reader in self.imus:
-            if reader.problem:
-                self._imu_problems_told.add(reader.name)
-                if reader.settings.required:
-                    raise RequestRefusedError("not-ready", f"imu {reader.name}: {reader.problem}")
-                self._note_missing(f"imu {reader.name}: {reader.problem}")
-            else:
+            if reader.problem and reader.settings.required:
+                raise RequestRefusedError("not-ready", f"imu {reader.name}: {reader.problem}")
+            for words in reader.news():
+                self._note_missing(f"imu {reader.name}: {words}")
+            if reader.is_ready:
                 self.log.add("imu started", name=reader.name, scheduling=reader.scheduling)
                 if (found := reader.description()) is not None and found.calibration_restored:
                     self.log.add("imu calibration restored", name=reader.name, chip_id=found.chip_id)
@@ -180,8 +157,8 @@ class Session:
     def _wait_for_pre_roll(self) -> None:
         """Wait until every sensor that works has delivered for as long as a run looks back."""
         starts_ns = [d.t0_ns for i in self.imus if i.is_ready and (d := i.description()) is not None]
-        if not self._camera_problem:
-            starts_ns.append((self.ring.first_keyframe_us or 0) * 1000)
+        if not self.camera.problem:
+            starts_ns.append((self.camera.ring.first_keyframe_us or 0) * 1000)
         full_ns = max(starts_ns) + round(self._config.recording.pre_roll_s * 1e9)
         while monotonic_ns() < full_ns:
             self._beat()
@@ -197,14 +174,14 @@ class Session:
     @property
     def has_sensors(self) -> bool:
         """Whether anything still delivers."""
-        return not self._camera_problem or any(i.is_ready for i in self.imus)
+        return not self.camera.problem or any(i.is_ready for i in self.imus)
 
     @property
     def lost_required(self) -> str:
         """What the configuration requires and does not deliver any more, in words; empty if all is well."""
         lost = [f"imu {i.name}: {i.problem}" for i in self.imus if i.settings.required and i.problem]
-        if self._config.camera.required and self._camera_problem:
-            lost.insert(0, f"camera: {self._camera_problem}")
+        if self._config.camera.required and (problem := self.camera.problem):
+            lost.insert(0, f"camera: {problem}")
         return "; ".join(lost)
 
     @property
@@ -218,32 +195,23 @@ class Session:
         )
 
     def poll(self) -> None:
-        """See how the sensors are, and note what was lost."""
-        self._watch_line()
+        """See how the sensors are, and note what was lost; they deliver whether or not this works."""
+        for name, look in (
+            ("line", self._watch_line),
+            ("imus", self._watch_imus),
+            ("camera", self._watch_camera),
+        ):
+            self._unless_it_fails(f"watching the {name}", look, None)
+
+    def _watch_imus(self) -> None:
         for reader in self.imus:
-            reader.poll()
-            if reader.problem and reader.name not in self._imu_problems_told:
-                self._imu_problems_told.add(reader.name)
-                self._note_missing(f"imu {reader.name}: {reader.problem}{self._when()}")
-            if reader.reset_words and reader.name not in self._imu_resets_told:
-                self._imu_resets_told.add(reader.name)
-                self._note_missing(f"imu {reader.name}: {reader.reset_words}{self._when()}")
-        self._watch_camera()
+            reader.poll(may_give_up=self.t0_ns is None)
+            for words in reader.news():
+                self._note_missing(f"imu {reader.name}: {words}{self._when()}")
 
     def _watch_camera(self) -> None:
-        """Note what the camera itself says is wrong, and when no pictures come any more."""
-        if self._camera is None or self._camera_section is None or self._camera_problem:
-            return
-        words = self._camera.problem() or ""
-        if words and not self._camera_words_told:
-            self._camera_words_told = words
+        for words in self.camera.news():
             self._note_missing(f"{words}{self._when()}")
-        period_ns = self._camera_section.frame_duration_us * 1000
-        newest_us = self.ring.newest_us
-        silent_ns = monotonic_ns() - (newest_us or 0) * 1000
-        if silent_ns > max(_SILENT_CAMERA_NS, 10 * period_ns):
-            self._camera_problem = f"no picture for {silent_ns / 1e9:.1f} s"
-            self._note_missing(f"camera: {self._camera_problem}{self._when()}")
 
     def _watch_line(self) -> None:
         """Say once in the log that the line does not rest low."""
@@ -260,14 +228,26 @@ class Session:
         self._trigger_triplet = read_clock_triplet()
         self.log.add("first edge", t0_ns=self.t0_ns)
 
+    def note_bug(self, words: str) -> bool:
+        """Note that the daemon itself went wrong, and tell whether that is new."""
+        if words in self.missing:
+            return False
+        self.missing.append(words)
+        self.log.add("bug", words=words)
+        return True
+
+    def is_surely_over(self, now_ns: int) -> bool:
+        """Tell whether nothing of the run's window can come in any more, by the clock alone."""
+        return now_ns > self.window_ns[1] + round(LATE_FRAMES_GRACE_S * 1e9)
+
     def is_over(self, now_ns: int) -> bool:
         """Tell whether everything of the run's window has come in, or will not any more."""
         end_ns = self.window_ns[1]
         if now_ns < end_ns:
             return False
-        if now_ns > end_ns + round(LATE_FRAMES_GRACE_S * 1e9):
+        if self.is_surely_over(now_ns):
             return True
-        pictures_in = bool(self._camera_problem) or (self.ring.newest_us or 0) * 1000 >= end_ns
+        pictures_in = bool(self.camera.problem) or (self.camera.ring.newest_us or 0) * 1000 >= end_ns
         newest_edge_ns = self.trigger.newest_edge_ns if self.trigger else None
         edges_in = (newest_edge_ns or 0) >= end_ns or now_ns > end_ns + LATE_EDGES_GRACE_NS
         return pictures_in and edges_in and all(i.has_slot_due_at(end_ns) for i in self.imus)
@@ -284,33 +264,24 @@ class Session:
             self.log.add("interrupted", words=interrupted)
         if self.trigger is None:
             raise HardwareError("there is no run to collect: the trigger was never watched")
-        line_is_high = self.trigger.line_is_high
         edges = self.trigger.disarm()
-        nominal_hz = self._config.trigger.nominal_hz
-        wave, wave_words = judge_edges(
-            edges.edges_ns,
-            nominal_hz=nominal_hz,
-            end_ns=until_ns,
-            rejected_ns=edges.rejected_ns,
-            line_is_high=line_is_high,
-        )
-        self.missing += edges.problems + wave_words
+        wave = self._unless_it_fails("the wave", lambda: self._judge_edges(edges, until_ns), WaveSection())
         for t_ns in edges.rejected_ns:
             self.log.add("rising edge before the first that counts", edge_ns=t_ns)
         imus = []
         for reader in self.imus:
-            description = reader.description()
-            if description is not None:
-                records = reader.records(start_ns, until_ns)
-                imus.append(ImuRecording(description, records, len(reader.slots_due(start_ns, until_ns))))
-                self.missing += imus[-1].problems()
-        video = self._cut_video(start_ns, until_ns)
+            taken = self._unless_it_fails(
+                f"imu {reader.name}", partial(_recording_of, reader, start_ns, until_ns), None
+            )
+            if taken is not None:
+                imus.append(taken)
+                self.missing += taken.problems()
+        video = self._unless_it_fails("video", lambda: self.camera.cut(start_ns, until_ns), None)
         if video is not None:
             self.missing += video.problems
         self.log.add("collected", frames=len(video.records) if video else 0, edges=len(edges.edges_ns))
-        hardware = self._rig.describe() | {
-            f"sampler of imu {i.name}": i.scheduling for i in self.imus if i.scheduling
-        }
+        described: dict[str, str] = self._unless_it_fails("the hardware", self._rig.describe, {})
+        hardware = described | {f"sampler of imu {i.name}": i.scheduling for i in self.imus if i.scheduling}
         if self._light.words:
             hardware["leds"] = self._light.words
         return Recording(
@@ -320,11 +291,11 @@ class Session:
             state="interrupted" if interrupted else "complete",
             simulated=self._rig.simulated,
             hardware=hardware,
-            camera=self._camera_section,
+            camera=self.camera.section,
             video=video,
             imus=imus,
             trigger_pin=self.trigger.pin_name,
-            nominal_hz=nominal_hz,
+            nominal_hz=self._config.trigger.nominal_hz,
             edges=edges,
             wave=wave,
             clocks=ClocksSection(arm=self._arm_triplet, trigger=self._trigger_triplet, end=end_triplet),
@@ -333,41 +304,44 @@ class Session:
             log=self.log,
         )
 
-    def _cut_video(self, start_ns: int, end_ns: int) -> VideoCut | None:
-        section, first_us = self._camera_section, self.ring.first_abs_us
-        if section is None or first_us is None:
-            return None
-        packets, metadata = self.ring.snapshot()
-        return cut_video(
-            packets,
-            metadata,
-            start_ns=start_ns,
-            end_ns=end_ns,
-            first_abs_us=first_us,
-            period_us=section.frame_duration_us,
-            default_exposure_us=section.exposure_us,
-            default_gain=section.analogue_gain,
+    def _unless_it_fails(self, what: str, make: Callable[[], T], otherwise: T) -> T:
+        """Return a part of the run, or ``otherwise`` where a bug is in the way: the other parts are kept."""
+        try:
+            return make()
+        except Exception as e:
+            if self.note_bug(f"{what}: internal error: {type(e).__name__}: {e}"):
+                logger.exception("%s: %s: a bug; the run goes on without", self.run_id, what)
+            return otherwise
+
+    def _judge_edges(self, edges: EdgeTrain, until_ns: int) -> WaveSection:
+        """Count what is wrong with the wave, and note it in words."""
+        wave, words = judge_edges(
+            edges.edges_ns,
+            nominal_hz=self._config.trigger.nominal_hz,
+            end_ns=until_ns,
+            rejected_ns=edges.rejected_ns,
+            line_is_high=self.trigger.line_is_high if self.trigger else None,
         )
+        self.missing += edges.problems + words
+        return wave
 
     def close(self) -> None:
-        """Let go of every sensor; what hangs is left behind. Calling it twice does no harm."""
-        with ExitStack() as at_last:
-            # Whatever the others raise: a sampler that nobody ends goes on, and keeps its memory.
-            for reader in self.imus:
-                at_last.callback(reader.stop)
-            if self.trigger is not None:
-                self.trigger.close()
-            camera, self._camera = self._camera, None
-            if camera is not None:
-                try:
-                    self._in_time("stop", camera.stop, CAMERA_STOP_TIMEOUT_S, give_up=False)
-                except (BricktrackError, OSError) as e:
-                    self.lost_camera = str(e)
-                    logger.warning("camera: %s", e)
+        """Let go of every sensor, whatever each of them says; what hangs is left behind.
 
-    def _in_time(self, what: str, call: Callable[[], T], timeout_s: float, *, give_up: bool = True) -> T:
-        """Return what a camera's call returns; a call that hangs is left to its thread."""
-        return in_time(what, call, timeout_s, beat=self._beat if give_up else lambda: None)
+        Never raises: the run that was collected still has to be saved. Calling it twice does no harm.
+        """
+        steps: list[tuple[str, Callable[[], None]]] = [("camera", self.camera.stop)]
+        # A sampler that nobody ends goes on, and keeps its memory.
+        steps += [(f"imu {reader.name}", reader.stop) for reader in self.imus]
+        if self.trigger is not None:
+            steps.insert(0, ("trigger", self.trigger.close))
+        for name, let_go in steps:
+            try:
+                let_go()
+            except (BricktrackError, OSError) as e:
+                logger.warning("%s: %s", name, e)
+            except Exception:
+                logger.exception("%s: a bug in letting go of it", name)
 
     def _note_missing(self, words: str) -> None:
         logger.warning("%s: %s", self.run_id, words)
@@ -376,3 +350,12 @@ class Session:
 
     def _when(self) -> str:
         return "" if self.t0_ns is None else f", {(monotonic_ns() - self.t0_ns) / 1e9:+.1f} s from t = 0"
+
+
+def _recording_of(reader: ImuReader, start_ns: int, end_ns: int) -> ImuRecording | None:
+    """Return one sensor's part of a run; `None` of a sensor that was never set up."""
+    description = reader.description()
+    if description is None:
+        return None
+    records = reader.records(start_ns, end_ns)
+    return ImuRecording(description, records, len(reader.slots_due(start_ns, end_ns)))

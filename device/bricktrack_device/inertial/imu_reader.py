@@ -1,7 +1,7 @@
 """One inertial sensor as the daemon sees it: its sampler process, watched, and the records of a run.
 
-A sampler that dies, hangs or never gets ready is noticed, ended and reported in words; it stops neither the
-camera nor the other sensors.
+A sampler that dies, hangs or never gets ready is noticed and reported in words; it stops neither the camera
+nor the other sensors. One that hangs in a run is left to go on: a bus may come free again.
 """
 
 import logging
@@ -96,6 +96,8 @@ class ImuReader:
         self._ready: SamplerReady | None = None
         self._problem = ""
         self._reset_words = ""
+        self._stall_words = ""
+        self._news: list[str] = []
         self._started_ns = 0
         self._seen_count = 0
         self._seen_at_ns = 0
@@ -110,11 +112,6 @@ class ImuReader:
     def problem(self) -> str:
         """Why there are no more samples, or ``""``."""
         return self._problem
-
-    @property
-    def reset_words(self) -> str:
-        """That the sensor was seen in another mode than it was set to, or ``""``; its samples go on."""
-        return self._reset_words
 
     @property
     def is_ready(self) -> bool:
@@ -137,8 +134,11 @@ class ImuReader:
         self._process.start()
         self._child_connection.close()
 
-    def poll(self) -> None:
-        """Take the sampler's messages and see whether it is alive and at work."""
+    def poll(self, *, may_give_up: bool = True) -> None:
+        """Take the sampler's messages and see whether it is alive and at work.
+
+        With ``may_give_up`` one that hangs is ended; without it may go on, and only `news` tells.
+        """
         if self._problem or self._buffer is None:
             return
         self._take_messages()
@@ -154,14 +154,24 @@ class ImuReader:
         else:
             count = self._buffer.count
             if count != self._seen_count:
-                self._seen_count, self._seen_at_ns = count, now
+                self._seen_count, self._seen_at_ns, self._stall_words = count, now, ""
                 self._look_for_reset(self._ready.facts.opr_mode)
             elif now - self._seen_at_ns > max(_HANG_NS, _HANG_PERIODS * self._period_ns):
                 silent_s = (now - self._seen_at_ns) / 1e9
-                self._problem = f"its sampler hangs: no slot for {silent_s:.1f} s; the bus may be stuck"
+                words = f"its sampler hangs: no slot for {silent_s:.1f} s; the bus may be stuck"
+                if may_give_up:
+                    self._problem = words
+                elif not self._stall_words:
+                    self._stall_words = words
+                    self._news.append(words)
         if self._problem:
-            logger.warning("imu %s: %s", self.name, self._problem)
+            self._news.append(self._problem)
             self._end_process()
+
+    def news(self) -> list[str]:
+        """Return in words what has gone wrong since the last time this was asked."""
+        told, self._news = self._news, []
+        return told
 
     def description(self) -> ImuDescription | None:
         """Return what the stream's header says, or `None` if the sensor was never ready."""
@@ -221,7 +231,7 @@ class ImuReader:
             samples=count - n_failed,
             gaps=max(0, slots - count) + n_failed,
             calibration=calibration,
-            problem=self._problem or self._reset_words,
+            problem=self._problem or self._stall_words or self._reset_words,
         )
 
     def stop(self) -> None:
@@ -246,6 +256,7 @@ class ImuReader:
                 f"operation mode reads 0x{modes[-1]:02X} where 0x{opr_mode:02X} was set: the sensor was "
                 "reset and delivers nothing usable until the unit is armed again. Check its supply"
             )
+            self._news.append(self._reset_words)
 
     def _take_messages(self) -> None:
         try:

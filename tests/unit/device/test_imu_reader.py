@@ -1,5 +1,6 @@
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -64,12 +65,33 @@ def test_a_hanging_sampler_is_noticed_and_ended() -> None:
         reader.stop()
 
 
+def test_a_sampler_that_hangs_for_a_while_in_a_run_goes_on_and_only_a_gap_is_left() -> None:
+    reader = reader_on(FakeBusOpener(hang_after=20, hang_s=0.8))
+    reader.start()
+    told: list[str] = []
+    deadline = time.monotonic() + 15.0
+    try:
+        while reader.status().samples < 60:
+            assert time.monotonic() < deadline, reader.status()
+            reader.poll(may_give_up=False)
+            told += reader.news()
+            time.sleep(0.005)
+        assert reader.status().problem == "" and len(told) == 1 and "hangs: no slot for" in told[0]
+        records = reader.records(0, monotonic_ns())
+        gaps = [b.slot - a.slot for a, b in pairwise(records)]
+        # 0.8 s of slots of 5 ms; a slot that waits for the bus counts as taken.
+        assert max(gaps) >= 155 and len(records) >= 60
+    finally:
+        reader.stop()
+
+
 def test_a_sensor_that_resets_itself_in_silence_is_told_and_goes_on() -> None:
     reader = reader_on(FakeBusOpener(reset_after=30))
     reader.start()
     try:
-        poll_until(reader, lambda: bool(reader.reset_words))
+        poll_until(reader, lambda: bool(reader.status().problem))
         assert "reads 0x00 where 0x07 was set" in reader.status().problem
+        assert reader.news() == [reader.status().problem] and reader.news() == []
         assert reader.is_ready and not reader.problem
     finally:
         reader.stop()

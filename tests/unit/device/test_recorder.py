@@ -284,23 +284,87 @@ def test_a_run_kept_in_memory_is_saved_by_itself_when_space_comes_back(
     assert read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True).problems == []
 
 
-def test_a_bug_while_recording_saves_what_there_is_and_ends_in_fault(
+def test_a_bug_while_recording_ends_in_fault_once_the_whole_window_is_saved(
     bench: Callable[..., Bench], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    b = bench(recording=RecordingTable(duration_s=30.0, pre_roll_s=0.1, post_roll_s=0.0))
+    monkeypatch.setattr(session_module, "LATE_FRAMES_GRACE_S", 0.1)
+    b = bench(imu=[ImuTable(name="brick", bus="a")])
     armed = b.arm()
-    b.rig.pulse()
-    b.wait_for("recording")
 
-    def break_down(self: Session, now_ns: int) -> bool:
+    def break_down(self: Session, now_ns: int = 0) -> bool:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(Session, "is_over", break_down)
+    monkeypatch.setattr(Session, "note_trigger", break_down)
+    monkeypatch.setattr(Session, "is_over", break_down)  # in every tick
+    b.rig.pulse(3)
     b.wait_for("fault")
     assert "ZeroDivisionError" in b.recorder.status().reason
     run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
-    assert run.manifest.state == "interrupted" and run.frames is not None
+    m = run.manifest
+    assert m.state == "complete" and m.missing == ["internal error: ZeroDivisionError: a bug"]
+    assert run.frames is not None and m.window_ns is not None
+    assert m.window_ns[1] - 34_000_000 < run.frames.sensor_timestamp_ns[-1]
+    assert run.imus["brick"][1].t_ns[-1] > m.window_ns[1] - 20_000_000
     assert isinstance(b.ask("disarm"), Disarmed) and b.recorder.state == "idle"
+
+
+def test_a_bug_in_watching_the_sensors_costs_no_run(
+    bench: Callable[..., Bench], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def break_down(self: FakeCamera) -> str:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(FakeCamera, "problem", break_down)  # from arming on
+    b = bench()
+    armed = b.arm()
+    wait_until(lambda: "ZeroDivisionError" in b.recorder.status().reason)
+    b.rig.pulse(3)
+    b.wait_for("recording")
+    b.wait_for("idle")
+    m = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True).manifest
+    assert m.state == "complete" and m.missing == [
+        "watching the camera: internal error: ZeroDivisionError: a bug"
+    ]
+
+
+def test_a_bug_in_one_part_of_a_run_does_not_cost_the_others(
+    bench: Callable[..., Bench], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench(imu=[ImuTable(name="brick", bus="a")])
+
+    def break_down(*args: object, **more: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(session_module, "judge_edges", break_down)
+    monkeypatch.setattr(session_module, "ImuRecording", break_down)
+    monkeypatch.setattr(b.rig, "describe", break_down)
+    armed = b.arm()
+    b.rig.pulse(3)
+    b.wait_for("recording")
+    b.wait_for("idle")
+    run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
+    assert run.frames is not None and run.edges_ns.size == 3 and not run.imus
+    named = [words.partition(": internal error")[0] for words in run.manifest.missing]
+    assert named == ["the wave", "imu brick", "the hardware"]
+
+
+def test_a_pin_that_cannot_be_given_back_costs_no_run(
+    bench: Callable[..., Bench], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench(imu=[ImuTable(name="brick", bus="a")])
+    armed = b.arm()
+    session = b.recorder._session
+    assert session is not None and session.trigger is not None
+
+    def fail() -> None:
+        raise RuntimeError("GPIO not allocated")
+
+    monkeypatch.setattr(session.trigger, "close", fail)
+    b.rig.pulse(3)
+    b.wait_for("recording")
+    b.wait_for("idle")
+    assert read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True).manifest.state == "complete"
+    assert b.rig.camera.n_stops == 1 and not session.imus[0]._process.is_alive()
 
 
 def test_a_line_stuck_high_leaves_the_unit_armed_and_the_status_says_why(
@@ -372,8 +436,7 @@ def test_a_bug_in_stopping_the_camera_leaves_no_sampler_behind(bench: Callable[.
     assert session is not None
     reader = session.imus[0]
     camera.stop_error = RuntimeError("a bug")
-    reply = b.ask("disarm")
-    assert isinstance(reply, Refusal) and reply.code == "internal" and "a bug" in reply.message
+    assert isinstance(b.ask("disarm"), Disarmed) and b.recorder.restart_reason == "a bug"
     assert not reader._process.is_alive() and reader._buffer is None
 
 

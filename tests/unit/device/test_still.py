@@ -11,6 +11,7 @@ from bricktrack_common.checksums import crc32
 from bricktrack_common.run_manifest import CameraSection
 from bricktrack_device import still as still_module
 from bricktrack_device.backends import open_rig
+from bricktrack_device.capture import camera_stream
 from bricktrack_device.config import DeviceConfig, LedsTable
 from bricktrack_device.interfaces import Still
 from bricktrack_device.refusals import RequestRefusedError
@@ -122,11 +123,13 @@ def test_giving_up_while_the_camera_starts_stops_it() -> None:
     assert rig.camera.n_stops == 1
 
 
-def test_a_camera_that_hangs_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(still_module, "CAMERA_START_TIMEOUT_S", 0.05)
+def test_a_camera_that_hangs_is_left_behind_and_asks_for_a_new_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(camera_stream, "START_TIMEOUT_S", 0.05)
     rig = FakeRig()
     never = threading.Event()
     monkeypatch.setattr(rig.camera, "start", lambda sink: never.wait(5))
+    lost: list[str] = []
     with pytest.raises(RequestRefusedError, match="start hangs"):
-        take_still(DeviceConfig(), rig, lit=True, beat=lambda: None)
+        take_still(DeviceConfig(), rig, lit=True, beat=lambda: None, note_lost_camera=lost.append)
+    assert len(lost) == 1 and "start hangs" in lost[0]
     never.set()
