@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from bricktrack_host.cli._console import err
 
@@ -19,6 +20,9 @@ class StageBar:
     def stage(self, name: str, total: int | None) -> None:
         """Show that a stage begins."""
         self._progress.reset(self._task, total=total, description=f"{self._run_id}: {name}")
+        if total is None:  # which to rich means: the total of the stage before
+            [task] = (t for t in self._progress.tasks if t.id == self._task)
+            task.total = None
 
     def advance_to(self, done: int) -> None:
         """Show that so many steps of it are done."""
@@ -29,12 +33,19 @@ class StageBar:
         self._progress.remove_task(self._task)
 
 
+class _Count(MofNCompleteColumn):
+    """How many steps of how many; nothing where nobody counts."""
+
+    def render(self, task: Task) -> Text:
+        return Text() if task.total is None else super().render(task)
+
+
 def stage_bars() -> Progress:
     """Return bars for several runs side by side, shown while they are entered."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        MofNCompleteColumn(),
+        _Count(),
         TimeElapsedColumn(),
     )
     return Progress(*columns, console=err, transient=True)

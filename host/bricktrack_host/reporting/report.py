@@ -174,8 +174,9 @@ def _origin_tables(result: RunResult) -> list[OriginTable]:
     unit: list[tuple[str, str]] = [("recorded by", m.origin), ("state", m.state)]
     if m.camera is not None:
         c = m.camera
+        gain = f"{c.analogue_gain:g}" if c.analogue_gain else "unknown"  # 0: imported, and nobody knows
         unit.append(("camera", f"{c.model}, {c.mode.name}, {c.mode.width} x {c.mode.height}, exposure "
-                     f"{c.exposure_us} us, gain {c.analogue_gain:g}, {c.encoder}"))  # fmt: skip
+                     f"{c.exposure_us} us, gain {gain}, encoder {c.encoder}"))  # fmt: skip
     unit += [
         (f"inertial sensor {i.name}", f"range {i.acc_range_g:g} g, {1e9 / i.period_ns:g} slots a second, "
          f"latency {i.latency_ns / 1e6:g} ms")
