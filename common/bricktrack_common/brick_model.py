@@ -48,7 +48,8 @@ class ProfileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     Attributes
     ----------
     collar_mm : float
-        Length of the lit cylinder behind the dome's sphere centre.
+        Length of the lit cylinder behind the dome's sphere centre. Below zero there is none, and the dome is
+        so much taller than half a sphere.
     source : str
         How the figure was had: a fit names its recording. Never assumed.
     shift_sd_per_radius : float
@@ -56,7 +57,7 @@ class ProfileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         axis, over the LED's radius and the sine of the angle that it is seen at.
     """
 
-    collar_mm: Annotated[float, msgspec.Meta(ge=0)]
+    collar_mm: Annotated[float, msgspec.Meta(ge=-50, le=50)]
     source: Annotated[str, msgspec.Meta(min_length=1)]
     shift_sd_per_radius: Annotated[float, msgspec.Meta(ge=0, le=0.2)] = DEFAULT_SHIFT_SD_PER_RADIUS
 

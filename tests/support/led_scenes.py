@@ -55,17 +55,20 @@ def leds_in_camera(R: FloatArray, t: FloatArray, brick: BrickModel) -> FloatArra
 def lit_outline(
     centre: FloatArray, axis: FloatArray, *, radius: float, collar: float, camera: PinholeCamera, n: int = 240
 ) -> FloatArray:
-    """Outline of a dome on a collar in the picture: the hull of its projected surface, shape (m, 2), px."""
+    """Outline of a dome on a collar in the picture: the hull of its projected surface, shape (m, 2), px.
+
+    A collar below zero is half an ellipsoid that is so much higher than half a sphere.
+    """
     side = np.cross(axis, [0.3, 0.9, 0.1])
     side /= np.linalg.norm(side)
     other = np.cross(axis, side)
     around = np.linspace(0, 2 * np.pi, n, endpoint=False)
     ring = np.cos(around)[:, None] * side + np.sin(around)[:, None] * other
     parts = [
-        centre + radius * (np.sin(polar) * ring + np.cos(polar) * axis)
+        centre + radius * np.sin(polar) * ring + (radius + max(-collar, 0.0)) * np.cos(polar) * axis
         for polar in np.linspace(0, np.pi / 2, n // 4)
     ]
-    parts.append(centre - collar * axis + radius * ring)
+    parts.append(centre - max(collar, 0.0) * axis + radius * ring)
     uv = camera.project(np.concatenate(parts)).uv_px
     return np.asarray(uv[ConvexHull(uv).vertices])
 

@@ -38,8 +38,8 @@ def leds(
     """Fit the shape that LEDs of this type show, and write it into a copy of the layout file.
 
     A dome is no point: seen from the side, the middle of its light lies beside the middle of its sphere; how
-    far depends on the lit collar under the dome. The best recording is a sweep: the brick at rest at ten or
-    more places that fill the picture, near and far.
+    far depends on the dome's height or the lit collar under it. The best recording is a sweep: the brick at
+    rest at ten or more places that fill the picture, near and far.
 
     With --positions the LEDs' places are refined from the same frames. Pictures tell the pattern's shape
     only: the first LED stays the origin, and the others as a whole are neither turned about it nor made
@@ -140,8 +140,9 @@ def _show_collar(fit: "CollarFit", brick: "BrickModel", simulated: str) -> None:
     from bricktrack_host.cli._console import out
 
     _show_left_out(fit.left_out_px, brick)
+    what = "collar" if fit.collar_mm >= 0 else "no collar, and a dome higher than half a sphere by"
     out.print(
-        f"collar: {fit.collar_mm:.3f} +- {fit.sd_mm:.3f} mm, from {fit.n_leds} LEDs in {fit.n_frames} "
+        f"{what}: {abs(fit.collar_mm):.3f} +- {fit.sd_mm:.3f} mm, from {fit.n_leds} LEDs in {fit.n_frames} "
         f"frames{simulated}; the light's middle is then known to {100 * fit.shift_sd_per_radius:.2f} % of "
         "the radius"
     )

@@ -36,7 +36,6 @@ _MIN_LEDS = 5  # four leave two degrees of freedom, which one collar and a false
 _MIN_FRAMES = 5
 _N_FOLDS = 5
 _OUTLIER_SIGMAS = 4.0
-_BARELY_NEGATIVE_MM = 0.1
 _SIDE_ON_PX = 8.0  # of radius times sine; an LED seen from in front tells nothing of its shape
 LEAST_SHIFT_SD = 0.0015
 """Between LEDs that saturate, just do not, and are dim, the middle of the light moves along the axis by 0.001
@@ -54,6 +53,7 @@ class CollarFit:
     Attributes
     ----------
     collar_mm : float
+        Below zero: the dome is so much taller than half a sphere.
     sd_mm : float
         From the residuals of frames taken as independent groups, since errors of one frame's LEDs, and of
         frames at rest, repeat.
@@ -116,8 +116,8 @@ def fit_collar(
     Raises
     ------
     CalibrationError
-        If fewer than five frames show five LEDs that agree, the views do not determine the collar, or the fit
-        leaves the range from 0 to ``max_collar_radii``.
+        If fewer than five frames show five LEDs that agree, the views do not determine the collar, or it
+        comes out longer than ``max_collar_radii``, or the dome as much too tall.
 
     Notes
     -----
@@ -127,17 +127,16 @@ def fit_collar(
     sweep, problem, collar, left_out_px = _without_odd_leds(observations, ray_model, brick_model, start_mm)
     uv = sweep.uv_px
     longest = max_collar_radii * float(brick_model.led_radii_mm.max())
-    if -_BARELY_NEGATIVE_MM <= collar < 0:
-        collar = 0.0  # a bare dome whose limb is not as dark as its middle is bright
-    if not 0 <= collar <= longest:
+    if not -longest <= collar <= longest:
         what = (
-            "The light lies farther in front than a half sphere's: the domes are taller, or the layout's "
-            "positions lie behind the middles of their spheres. Correct the positions; or process with the "
-            "layout as it is, without a profile: covariances then allow for the unknown shape"
+            "The light lies farther in front than a tall dome's: do the layout's positions lie behind the "
+            "middles of the LEDs' spheres?"
             if collar < 0
             else "Check the LEDs' axes and radii in the layout, and the calibration"
         )
-        raise CalibrationError(f"fitted collar is {collar:.3f} mm; expected 0 to {longest:g} mm. {what}.")
+        raise CalibrationError(
+            f"fitted collar is {collar:.3f} mm; expected -{longest:g} to {longest:g} mm. {what}."
+        )
     residual, slope = problem.projected(collar)
     information = np.nansum(slope**2, axis=1)
     score = np.nansum(slope * residual, axis=1)
@@ -180,9 +179,7 @@ def _without_odd_leds(
             raise CalibrationError(f"{words_on_left_out(left_out_px, brick_model)} Then: {e}") from e
         problem = _Problem(sweep, ray_model, brick_model)
         collar = problem.solve(np.ones(len(sweep.uv_px), dtype=np.bool_), start_mm)
-        shown = ProfileEntry(
-            collar_mm=max(collar, 0.0), source="being fitted", shift_sd_per_radius=LEAST_SHIFT_SD
-        )
+        shown = ProfileEntry(collar_mm=collar, source="being fitted", shift_sd_per_radius=LEAST_SHIFT_SD)
         errors = errors_of_sweep(
             sweep, problem.poses(shown.collar_mm), ray_model, replace(brick_model, led_profile=shown)
         )
@@ -276,7 +273,7 @@ class _Problem:
         R, t = poses.R_camera_brick, poses.t_camera_brick_mm
         ok = all_finite(R, 2)
         R, t = np.where(ok[:, None, None], R, np.eye(3)), np.where(ok[:, None], t, [0.0, 0.0, 150.0])
-        low, high = max(collar_mm - step, 0.0), collar_mm + step
+        low, high = collar_mm - step, collar_mm + step
         here, J = predict_brick(R, t, self._rays, self._brick, collar_mm=collar_mm)
         below, _ = predict_brick(R, t, self._rays, self._brick, collar_mm=low)
         above, _ = predict_brick(R, t, self._rays, self._brick, collar_mm=high)
@@ -320,14 +317,14 @@ class _Problem:
         """Return the collar that fits the given frames best."""
         collar = start_mm
         for _ in range(20):
-            residual, slope = self.projected(max(collar, 0.0))
+            residual, slope = self.projected(collar)
             information = np.nansum(slope[which] ** 2)
             if not information > 1e-6:
                 raise CalibrationError(
                     "these views do not determine the collar; tilt the brick between frames"
                 )
             step = float(np.clip(np.nansum(slope[which] * residual[which]) / information, -0.5, 0.5))
-            collar = max(collar, 0.0) + step
-            if abs(step) < 1e-4 or collar < -0.3:
+            collar += step
+            if abs(step) < 1e-4:
                 break
         return collar

@@ -237,7 +237,7 @@ class _Problem:
     def errors(self, x: FloatArray) -> FrameErrors:
         """Return the errors of the frames with these positions and this collar."""
         profile = ProfileEntry(
-            collar_mm=max(float(x[-1]), 0.0), source="being fitted", shift_sd_per_radius=self._shift_sd
+            collar_mm=float(x[-1]), source="being fitted", shift_sd_per_radius=self._shift_sd
         )
         brick = replace(self._brick, led_positions_mm=self.positions_mm(x), led_profile=profile)
         return errors_of_sweep(self._sweep, self.poses(x), self._rays, brick)
@@ -246,7 +246,7 @@ class _Problem:
         """Return the poses and residuals for positions that are believed to ``loose_mm``."""
         brick = replace(self._brick, led_positions_mm=self.positions_mm(x))
         cov = self._covariance(loose_mm)
-        collar_mm = max(float(x[-1]), 0.0)
+        collar_mm = float(x[-1])
         return refine_poses(self._uv, cov, self._R, self._t, self._rays, brick, collar_mm=collar_mm)
 
     def _covariance(self, loose_mm: float) -> FloatArray:
@@ -256,7 +256,7 @@ class _Problem:
     def _equations(self, x: FloatArray, loose_mm: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Return each frame's normal matrix and right side, (n, m, m) and (n, m)."""
         brick = replace(self._brick, led_positions_mm=self.positions_mm(x))
-        collar_mm = max(float(x[-1]), 0.0)
+        collar_mm = float(x[-1])
         poses = self.poses(x, loose_mm)
         ok = all_finite(poses.R_camera_brick, 2)
         R = np.where(ok[:, None, None], poses.R_camera_brick, np.eye(3))

@@ -20,7 +20,7 @@ def views(n, seed, largest_deg=85.0):
     return centres, np.cos(psi) * away + np.sin(psi) * across
 
 
-@pytest.mark.parametrize("collar", [0.0, 0.4, 0.9, 2.0])
+@pytest.mark.parametrize("collar", [-1.0, -0.4, 0.0, 0.4, 0.9, 2.0])
 def test_centroids_from_the_table_are_those_of_the_closed_form(collar):
     # On the camera's axis, no distortion: a millimetre along the projected axis is f / z px.
     plain = PinholeCamera(k1=0.0, k2=0.0, p1=0.0, p2=0.0)
@@ -31,7 +31,8 @@ def test_centroids_from_the_table_are_those_of_the_closed_form(collar):
     area, centroid, _ = outline_moments(np.cos(psi), radius_mm=RADIUS_MM, collar_mm=collar, distance_mm=z)
     seen = predict_leds(centre, axis, RADIUS_MM, plain, collar_mm=collar)
     np.testing.assert_allclose(seen.uv_px[:, 0] - 959.5, centroid * 1560.0 / z, atol=1e-4)
-    np.testing.assert_allclose(seen.area_px2, area * (1560.0 / z) ** 2, rtol=1e-4)
+    # Where the dome hides its rim, within two degrees, the table stands, and a tall dome's area still grows.
+    np.testing.assert_allclose(seen.area_px2, area * (1560.0 / z) ** 2, rtol=1e-4 if collar >= 0 else 5e-4)
 
 
 def test_leds_of_several_radii_have_each_their_own_outline():

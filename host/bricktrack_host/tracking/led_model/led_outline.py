@@ -41,7 +41,10 @@ class Outlines(NamedTuple):
 
 
 def outlines_of(radii_mm: ArrayLike, collar_mm: float | None) -> Outlines:
-    """Return the outlines of LEDs of such radii, shape (n_leds,); without a fitted collar the spheres'."""
+    """Return the outlines of LEDs of such radii, shape (n_leds,); without a fitted collar the spheres'.
+
+    A collar below zero is a dome that is so much taller than half a sphere.
+    """
     radii = np.asarray(radii_mm, dtype=np.float64)
     if collar_mm is None:
         return Outlines(_table_of(None)[None], np.zeros(radii.shape, dtype=np.int64))
@@ -65,6 +68,8 @@ def _table_of(collar_radii: float | None) -> FloatArray:
 @compiled_in_place
 def outline(c: float, r: float, h: float, distance: float) -> tuple[float, float, float]:
     """Return area, centroid and half length of an outline; see `led_profile.outline_moments`."""
+    if h < 0:
+        return _tall_outline(c, r, 1 - h / r, distance)
     s = math.sqrt(max(1 - c * c, 0.0))
     rho = r / math.sqrt(1 - (r / distance) ** 2)
     far = (-h * s + r * c) / (distance + h * c + r * s)
@@ -94,6 +99,46 @@ def outline(c: float, r: float, h: float, distance: float) -> tuple[float, float
     )
     rear = min(x_e - p, -rho if x <= -1 + 1e-12 else 0.0)
     return 2 * half_area, half_moment / half_area, 0.5 * (rho - rear)
+
+
+@compiled_in_place
+def _tall_outline(c: float, r: float, tall: float, distance: float) -> tuple[float, float, float]:
+    """Return the same of half an ellipsoid, ``tall`` times as high as a half sphere.
+
+    In front it is the ellipsoid's tangent cone, cut across the line of sight, and at the rear the rim's
+    ellipse; the two touch where the rim's own normal is across the ray.
+    """
+    s, tall2 = math.sqrt(max(1 - c * c, 0.0)), tall * tall
+    cone = distance**2 - r * r * (s * s + tall2 * c * c)
+    x_f = r * r * distance * s * c * (tall2 - 1) / cone
+    length = math.sqrt(x_f * x_f + (r * distance) ** 2 * (c * c + tall2 * s * s) / cone)
+    beyond = (distance / r) ** 2 * (s * s + c * c / tall2) - 1
+    across = (x_f * distance * s * c * (1 - 1 / tall2) / r**2 + 1) ** 2 / beyond
+    width = r * math.sqrt(across + 1 - (x_f / r) ** 2 * (c * c + s * s / tall2))
+    if distance * s <= r:  # the rim is behind the dome
+        return math.pi * length * width, x_f, length
+    cos_rim = r / (distance * s)
+    x_rim = -c * r * cos_rim / (1 - s * r * cos_rim / distance)
+    far, near = r * c / (distance + r * s), -r * c / (distance - r * s)
+    x_e, p = 0.5 * distance * (far + near), 0.5 * distance * abs(far - near)
+    q = r / math.sqrt(1 - (r * s / distance) ** 2)
+    front = math.acos(min(max((x_rim - x_f) / length, -1.0), 1.0))
+    rear = math.pi - math.acos(min(max((x_rim - x_e) / p, -1.0), 1.0)) if p > 0 else 0.0
+    half_area, half_moment = _cap(length, width, front)
+    half_moment += x_f * half_area
+    rear_area, rear_moment = _cap(p, q, rear)
+    half_area, half_moment = half_area + rear_area, half_moment + x_e * rear_area - rear_moment
+    return 2 * half_area, half_moment / half_area, 0.5 * (x_f + length - x_e + p)
+
+
+@compiled_inline
+def _cap(length: float, width: float, angle: float) -> tuple[float, float]:
+    """Return half the area of an ellipse's end, up to an angle from its tip, and its moment about the middle.
+
+    ``length`` and ``width`` are half axes; the tip is at the end of the first.
+    """
+    sine = math.sin(angle)
+    return 0.5 * length * width * (angle - sine * math.cos(angle)), length**2 * width * sine**3 / 3
 
 
 @compiled_inline
