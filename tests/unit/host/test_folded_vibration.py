@@ -11,7 +11,7 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.inertial.imu_samples import clean_samples
-from bricktrack_host.fusion.inertial.vibration_phase import phase_jumps, vibration_phase
+from bricktrack_host.fusion.inertial.vibration_phase import low_pass, phase_jumps, vibration_phase
 from bricktrack_host.fusion.pose_by_pose.camera_accelerations import CameraAccelerations
 from bricktrack_host.fusion.pose_by_pose.folded_vibration import samples_beside_camera
 
@@ -149,3 +149,12 @@ def test_camera_and_samples_agree_where_nothing_is_false():
     # The same through the samples: a transpose gives the same product, but for lines in place of cubics.
     left = np.random.default_rng(8).normal(0, 1, of.shape) + of
     assert (camera.seen_by_samples(left) * false).sum() * 0.01 == pytest.approx(float(left @ of), rel=0.05)
+
+
+def test_a_low_pass_keeps_what_is_slow_where_it_is():
+    t_s = np.arange(0.0, 6.0, 0.01)
+    slow, fast = np.sin(2 * np.pi * 3.0 * t_s)[:, None], np.sin(2 * np.pi * 30.0 * t_s)[:, None]
+    kept = low_pass(slow + fast, 12.0, rate_hz=100.0)
+    # A Hamming window leaves a five-hundredth beyond its edge; at the ends a mirrored sine has a corner.
+    np.testing.assert_allclose(kept[50:-50], slow[50:-50], atol=0.005)
+    np.testing.assert_allclose(low_pass(np.full((80, 1), 2.0 + 1j), 1.2, rate_hz=100.0), 2.0 + 1j)

@@ -7,20 +7,21 @@ in frequency, and pulses where its phase jumps: both are known up to a factor on
 """
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import firwin
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_host.compiled import compiled
 from bricktrack_host.fusion.inertial.vibration import interpolation_error, prediction_coefficients
 
 ComplexArray = NDArray[np.complex128]
+_Number = TypeVar("_Number", np.float64, np.complex128)
 
 _LEAST_HZ = 15.0  # below, bricks move
 _HALF_WIDTH_HZ = 1.2  # by which a motor's speed wanders and mounts sway, and no neighbouring copy comes in
-_HALF_TAPS = 50  # of the low-pass about the vibration, at 100 Hz
+_HALF_TAPS = 50  # of a low-pass: half a second at 100 Hz
 _ORDER = 24
 _FEWEST = 4 * _HALF_TAPS
 _SHORTEST_BEAT = 12.0  # samples: below, what is between two jumps is no steady vibration
@@ -69,12 +70,22 @@ def vibration_phase(t_s: FloatArray, acc_mps2: FloatArray) -> VibrationPhase | N
     power = (np.abs(np.fft.rfft(acc * np.hanning(n)[:, None], axis=0)) ** 2).sum(axis=1)
     hz = np.fft.rfftfreq(n, 1 / rate_hz)
     frequency_hz = float(hz[np.argmax(np.where(hz > _LEAST_HZ, power, 0.0))])
-    slow = acc * np.exp(-2j * np.pi * frequency_hz * t_s)[:, None]
-    taps = firwin(2 * _HALF_TAPS + 1, _HALF_WIDTH_HZ, fs=rate_hz)
-    padded = np.pad(slow, ((_HALF_TAPS, _HALF_TAPS), (0, 0)), mode="reflect")
-    slow = np.stack([np.convolve(axis, taps, "valid") for axis in padded.T], axis=1)
+    turned = np.asarray(acc * np.exp(-2j * np.pi * frequency_hz * t_s)[:, None])
+    slow = low_pass(turned, _HALF_WIDTH_HZ, rate_hz=rate_hz)
     shared = np.linalg.svd(slow, full_matrices=False)[0][:, 0]
     return VibrationPhase(frequency_hz, t_s, shared / np.maximum(np.abs(shared), 1e-12))
+
+
+def low_pass(values: NDArray[_Number], cut_hz: float, *, rate_hz: float) -> NDArray[_Number]:
+    """Return what of samples, shape (n, d), is slower than a frequency; none of it comes late.
+
+    By a windowed sinc of half a second at 100 Hz; at both ends the samples are mirrored. n is above 50.
+    """
+    # Written out: of SciPy, the signals take longest to load.
+    taps = np.sinc(2 * cut_hz / rate_hz * np.arange(-_HALF_TAPS, _HALF_TAPS + 1))
+    taps *= np.hamming(len(taps))
+    padded = np.pad(values, ((_HALF_TAPS, _HALF_TAPS), (0, 0)), mode="reflect")
+    return np.stack([np.convolve(axis, taps / taps.sum(), "valid") for axis in padded.T], axis=1)
 
 
 def phase_jumps(acc_mps2: FloatArray) -> tuple[float, float] | None:

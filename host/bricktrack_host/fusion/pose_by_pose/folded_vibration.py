@@ -15,7 +15,6 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.signal import butter, filtfilt
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import TrackingError
@@ -24,6 +23,7 @@ from bricktrack_host.fusion.inertial.imu_samples import CleanSamples, clean_samp
 from bricktrack_host.fusion.inertial.vibration_phase import (
     ComplexArray,
     VibrationPhase,
+    low_pass,
     phase_jumps,
     vibration_phase,
 )
@@ -115,8 +115,8 @@ class _Fit:
         self.waves: list[ComplexArray] = []
         R, acc = camera.R, samples.acc_mps2
         still = [np.broadcast_to(axis, acc.shape) for axis in np.eye(3)]  # gravity
-        b, a = butter(2, _LAG_HZ, fs=1 / float(np.median(np.diff(samples.t_s))))
-        lag = np.gradient(filtfilt(b, a, acc, axis=0), samples.t_s, axis=0)
+        rate_hz = 1 / float(np.median(np.diff(samples.t_s)))
+        lag = np.gradient(low_pass(acc, _LAG_HZ, rate_hz=rate_hz), samples.t_s, axis=0)
         gains = [R[:, :, i] * acc[:, j, None] for i in range(3) for j in range(3)]
         biases = [R[:, :, i] for i in range(3)]
         A = camera.of([*still, *biases, *gains, np.einsum("nij,nj->ni", R, lag)])
