@@ -25,9 +25,13 @@ from bricktrack_common.wire_messages import (
     encode_message,
 )
 
+PATIENCE_S = 120.0
+"""For a computer that does much else; what works comes far sooner."""
 CONFIG = """
 [storage]
 margin_mb = 1
+[camera]
+frame_rate_hz = 10.0
 [recording]
 duration_s = 1.5
 pre_roll_s = 0.3
@@ -61,7 +65,7 @@ class Process:
             self.log.append(line.rstrip())
 
     def _wait_for_port(self) -> int:
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline and self.process.poll() is None:
             found = re.search(r"serves on \S+ port (\d+)", "\n".join(self.log))
             if found:
@@ -69,7 +73,7 @@ class Process:
             time.sleep(0.02)
         raise AssertionError("\n".join(self.log))
 
-    def ask(self, request: Request, timeout_ms: int = 40_000) -> Reply:
+    def ask(self, request: Request, timeout_ms: int = round(1000 * PATIENCE_S)) -> Reply:
         wanted = next(self._ids)
         self.socket.send(encode_message(wanted, request))
         assert self.socket.poll(timeout_ms), f"no reply to {request}\n" + "\n".join(self.log)
@@ -82,7 +86,7 @@ class Process:
         assert isinstance(reply, StatusReply)
         return reply
 
-    def wait_for(self, state: str, timeout_s: float = 40.0) -> None:
+    def wait_for(self, state: str, timeout_s: float = PATIENCE_S) -> None:
         deadline = time.monotonic() + timeout_s
         while (status := self.status()).state != state:
             assert time.monotonic() < deadline, f"{status}\n" + "\n".join(self.log)
@@ -90,7 +94,7 @@ class Process:
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
         self.process.send_signal(number)
-        code = self.process.wait(timeout=30)
+        code = self.process.wait(timeout=PATIENCE_S)
         self._reader.join()
         return code
 

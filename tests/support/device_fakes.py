@@ -1,6 +1,7 @@
 """The least hardware that the daemon's parts can be tried on: no picture, no motion, only the interfaces."""
 
 import errno
+import multiprocessing
 import os
 import threading
 import time
@@ -138,8 +139,9 @@ class FakeBusOpener:
     def __call__(self) -> I2cBus:
         if self.hang_at_opening:
             time.sleep(3600)
-        # Called in the sampler's process: there the driver need not wait 0.7 s for a table of registers.
-        adafruit_bno055.time = SimpleNamespace(sleep=lambda seconds: None)
+        if multiprocessing.parent_process() is not None:
+            # In a sampler's process the driver need not wait 0.7 s for a table of registers.
+            adafruit_bno055.time = SimpleNamespace(sleep=lambda seconds: None)
         return FakeBus(
             present=self.present, hang_after=self.hang_after, hang_s=self.hang_s, exit_after=self.exit_after,
             fail_every=self.fail_every, reset_after=self.reset_after,

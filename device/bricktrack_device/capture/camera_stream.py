@@ -117,8 +117,8 @@ class CameraStream:
             found.append(own_words)
         silence = self.problem
         if silence and not self._silence_told:
+            self._silence_told = True
             found.append(f"camera: {silence}")
-        self._silence_told = bool(silence)
         return found
 
     def cut(self, start_ns: int, end_ns: int) -> VideoCut | None:

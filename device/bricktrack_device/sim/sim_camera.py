@@ -1,6 +1,6 @@
 """The simulated camera: pictures of the world, free-running, through a real H.264 encoder.
 
-Like the real one it never waits: a frame that finds no buffer is dropped, and shows as a gap in the stamps.
+Like the real one it waits for nobody: a frame that is too late is dropped, and shows as a gap in the stamps.
 """
 
 import logging
@@ -29,13 +29,35 @@ logger = logging.getLogger(__name__)
 
 LINES_A_FRAME = 1763  # what libcamera makes of 33333 us at the IMX219's line time: 30.0058 frames a second
 _SENSOR_FRAME_RATE_HZ = 30.0
-_BUFFERS = 6  # as picamera2's video configuration has
+_MAX_LAG_S = 0.5
+"""How late a picture may be rendered on a busy computer; twice that is a silent camera for the daemon."""
+_MAX_WAITING = 2
+"""Rendered pictures that wait for the encoder, 2 MB each."""
 
 
 class SimCamera:
-    """A simulated IMX219 in its 1080p mode, meeting `interfaces.Camera`."""
+    """A simulated IMX219 in its 1080p mode, meeting `interfaces.Camera`.
 
-    def __init__(self, world: SimWorld, settings: "CameraTable", switch: LedSwitch | None = None) -> None:
+    Parameters
+    ----------
+    world : SimWorld
+    settings : CameraTable
+    switch : LedSwitch, optional
+        What lights the LEDs; they are lit without one.
+    runs_free : bool
+        Give each picture when it is rendered, whatever the clock says, and lose none: stamps only count from
+        the clock then.
+    """
+
+    def __init__(
+        self,
+        world: SimWorld,
+        settings: "CameraTable",
+        switch: LedSwitch | None = None,
+        *,
+        runs_free: bool = False,
+    ) -> None:
+        self._runs_free = runs_free
         self._world = world
         self._switch = switch
         self._settings = settings
@@ -66,7 +88,7 @@ class SimCamera:
         encoder = VideoEncoder(s, mode.width, mode.height)
         self._stopping.clear()
         self._encoder_failed = False
-        self._to_encode = queue.Queue(_BUFFERS)
+        self._to_encode = queue.Queue(_MAX_WAITING)
         self._threads = [
             threading.Thread(target=target, args=args, name=name, daemon=True)
             for name, target, args in (
@@ -108,7 +130,7 @@ class SimCamera:
         self._newest = None
 
     def _film(self, renderer: LedRenderer, sink: FrameSink, period_ns: float, exposure_us: int) -> None:
-        """Render each frame when its read-out is over; skip frames when all buffers' time has passed."""
+        """Render each frame when its read-out is over; skip frames that are too late."""
         faults = self._world.settings.faults
         read_out_ns = float(self._mode.row_delay_ns(self._mode.height))
         start = monotonic_ns()
@@ -116,13 +138,13 @@ class SimCamera:
         while not self._stopping.is_set():
             k += 1
             stamp = start + round(k * period_ns)
-            wait_s = (stamp + read_out_ns - monotonic_ns()) * 1e-9
+            wait_s = 0.0 if self._runs_free else (stamp + read_out_ns - monotonic_ns()) * 1e-9
             if wait_s > 0 and self._stopping.wait(wait_s):
                 break
             if faults.camera_dies_after_s is not None and (stamp - start) * 1e-9 > faults.camera_dies_after_s:
                 break
             dropped = faults.drop_frame_every and k % faults.drop_frame_every == 0
-            if dropped or wait_s < -_BUFFERS * period_ns * 1e-9 or self._to_encode.full():
+            if dropped or wait_s < -_MAX_LAG_S:
                 self.frames_dropped += 1
                 continue
             luma = renderer.luma(stamp)

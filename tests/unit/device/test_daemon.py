@@ -68,7 +68,7 @@ class Unit:
         self.socket.connect(f"tcp://127.0.0.1:{self.daemon.port}")
 
     @staticmethod
-    def wait(condition: object, timeout_s: float = 10.0) -> None:
+    def wait(condition: object, timeout_s: float = 60.0) -> None:
         deadline = time.monotonic() + timeout_s
         while not condition():  # type: ignore[operator]
             assert time.monotonic() < deadline
@@ -76,7 +76,7 @@ class Unit:
 
     def ask(self, request: Request) -> tuple[Reply, bytes | None]:
         self.socket.send(encode_message(1, request))
-        assert self.socket.poll(20_000), f"no reply to {request}"
+        assert self.socket.poll(60_000), f"no reply to {request}"
         header, *rest = self.socket.recv_multipart()
         return decode_reply(header)[1], (rest[0] if rest else None)
 
@@ -86,11 +86,11 @@ class Unit:
         return reply
 
     def record(self, label: str = "") -> str:
+        n_before = self.status().runs
         armed, _ = self.ask(Arm(label=label))
         assert isinstance(armed, Armed), armed
         self.rig.pulse()
-        self.wait(lambda: self.status().state == "recording")
-        self.wait(lambda: self.status().state == "idle")
+        self.wait(lambda: self.status().runs > n_before and self.status().state == "idle")
         return armed.run_id
 
     def close(self) -> None:

@@ -41,7 +41,7 @@ def config_for(folder: Path, **changes: object) -> DeviceConfig:
     return msgspec.structs.replace(config, **changes)
 
 
-def wait_until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+def wait_until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "the condition was not met in time"
@@ -58,15 +58,19 @@ class Bench:
         self.recorder = Recorder(config, rig, self.store)
         self.recorder.start()
 
-    def ask(self, what: str, *args: object, timeout_s: float = 20.0) -> Reply:
+    def ask(self, what: str, *args: object, timeout_s: float = 60.0) -> Reply:
         answers: queue.Queue[Reply] = queue.Queue()
         getattr(self.recorder, what)(*args, answers.put)
         return answers.get(timeout=timeout_s)
 
     def arm(self, label: str = "", duration_s: float | None = None) -> Armed:
+        self.n_runs_before = self.store.count_runs()
         reply = self.ask("arm", label, duration_s)
         assert isinstance(reply, Armed), reply
         return reply
+
+    def wait_for_run(self) -> None:
+        wait_until(lambda: self.store.count_runs() > self.n_runs_before and self.recorder.state == "idle")
 
     def wait_for(self, state: str) -> None:
         wait_until(lambda: self.recorder.state == state)
@@ -90,8 +94,7 @@ def test_an_edge_makes_a_whole_run_around_it(bench: Callable[..., Bench], tmp_pa
     armed = b.arm("shake")
     assert b.recorder.state == "armed" and b.rig.armed_ns
     b.rig.pulse(3)
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
     m = run.manifest
     assert m.state == "complete" and m.missing == [] and run.problems == []
@@ -137,8 +140,7 @@ def test_a_missing_imu_stops_neither_the_camera_nor_the_other(
     armed = b.arm()
     assert len(armed.missing) == 1 and "imu gone" in armed.missing[0] and "0x28" in armed.missing[0]
     rig.pulse()
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
     assert list(run.imus) == ["brick"] and run.frames is not None
     assert any("imu gone" in words for words in run.manifest.missing)
@@ -151,8 +153,7 @@ def test_a_sampler_that_dies_during_the_run_is_said_and_its_samples_kept(
     b = bench(rig=rig, imu=[ImuTable(name="brick", bus="a")])
     armed = b.arm()
     rig.pulse()
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
     assert any("died (exit code 7)" in words for words in run.manifest.missing)
     _, samples = run.imus["brick"]
@@ -177,8 +178,7 @@ def test_a_camera_that_is_not_required_may_be_missing(bench: Callable[..., Bench
     armed = b.arm()
     assert armed.missing == ["camera: no camera"]
     b.rig.pulse()
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     run = read_run(tmp_path / "runs" / armed.run_id)
     assert run.frames is None and run.video is None and run.imus and run.manifest.camera is None
 
@@ -192,8 +192,7 @@ def test_a_camera_that_falls_silent_is_noticed_and_what_came_is_kept(
     )
     armed = b.arm()
     b.rig.pulse()
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
     assert any("camera: no picture" in words for words in run.manifest.missing)
     assert any("video: ends" in words for words in run.manifest.missing)
@@ -319,8 +318,7 @@ def test_a_bug_in_watching_the_sensors_costs_no_run(
     armed = b.arm()
     wait_until(lambda: "ZeroDivisionError" in b.recorder.status().reason)
     b.rig.pulse(3)
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     m = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True).manifest
     assert m.state == "complete" and m.missing == [
         "watching the camera: internal error: ZeroDivisionError: a bug"
@@ -340,8 +338,7 @@ def test_a_bug_in_one_part_of_a_run_does_not_cost_the_others(
     monkeypatch.setattr(b.rig, "describe", break_down)
     armed = b.arm()
     b.rig.pulse(3)
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     run = read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True)
     assert run.frames is not None and run.edges_ns.size == 3 and not run.imus
     named = [words.partition(": internal error")[0] for words in run.manifest.missing]
@@ -361,8 +358,7 @@ def test_a_pin_that_cannot_be_given_back_costs_no_run(
 
     monkeypatch.setattr(session.trigger, "close", fail)
     b.rig.pulse(3)
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     assert read_run(tmp_path / "runs" / armed.run_id, verify_hashes=True).manifest.state == "complete"
     assert b.rig.camera.n_stops == 1 and not session.imus[0]._process.is_alive()
 
@@ -381,8 +377,7 @@ def test_a_line_stuck_high_leaves_the_unit_armed_and_the_status_says_why(
     assert b.recorder.state == "armed" and "high all the time" in b.recorder.status().reason
     b.rig.factory.pin("GPIO17").drive_low()
     b.rig.pulse()
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     assert b.recorder.status().reason == ""
 
 
@@ -422,8 +417,7 @@ def test_a_camera_that_does_not_stop_asks_for_a_new_start_once_nothing_is_under_
     b.arm()
     assert b.recorder.restart_reason == ""
     b.rig.pulse(3)
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     assert b.recorder.restart_reason == "camera: it did not stop within 4.5 s"
     assert b.store.list_runs()[0].state == "complete"
 
@@ -448,7 +442,6 @@ def test_what_the_camera_itself_says_is_wrong_stands_in_the_run(
     run_id = b.arm().run_id
     camera.trouble = "camera: 3 frames were lost on the way: disk"
     b.rig.pulse(3)
-    b.wait_for("recording")
-    b.wait_for("idle")
+    b.wait_for_run()
     missing = read_run(tmp_path / "runs" / run_id).manifest.missing
     assert [m for m in missing if m.startswith(camera.trouble)] and len(missing) == 1

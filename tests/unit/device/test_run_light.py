@@ -59,10 +59,10 @@ class Bench:
     def ask(self, what: str, *args: object) -> Reply:
         answers: queue.Queue[Reply] = queue.Queue()
         getattr(self.recorder, what)(*args, answers.put)
-        return answers.get(timeout=20)
+        return answers.get(timeout=60)
 
     def wait_for(self, state: str) -> None:
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while self.recorder.state != state:
             assert time.monotonic() < deadline
             time.sleep(0.005)

@@ -40,21 +40,22 @@ class Sink:
 
 
 def film(
-    settings: SimSettings, n: int, *, shaking: bool = False, timeout_s: float = 20.0
+    settings: SimSettings, n: int, *, shaking: bool = False
 ) -> tuple[SimWorld, Sink, CameraSection, SimCamera]:
     world = SimWorld(settings, make_epoch())
     if shaking:
         world.schedule(monotonic_ns() - 3_000_000_000)
-    camera, sink = SimCamera(world, CameraTable(exposure_us=2000, iperiod=10)), Sink(n)
+    camera, sink = SimCamera(world, CameraTable(exposure_us=2000, iperiod=10), runs_free=True), Sink(n)
     section = camera.start(sink)
-    sink.done.wait(timeout_s)
+    while not sink.done.wait(0.05) and camera.problem() is None:
+        pass
     camera.stop()
     return world, sink, section, camera
 
 
 @pytest.fixture(scope="module")
 def shake() -> tuple[SimWorld, Sink, CameraSection, SimCamera]:
-    return film(SimSettings(motion="sines", clutter=0.0), 35, shaking=True)
+    return film(SimSettings(motion="sines", clutter=0.0, shake_s=120.0), 35, shaking=True)
 
 
 Filmed = tuple[SimWorld, Sink, CameraSection, SimCamera]
@@ -65,8 +66,7 @@ def test_stamps_are_whole_periods_apart_and_gaps_are_dropped_frames(shake: Filme
     stamps = [m.sensor_timestamp_ns for m in sink.metadata]
     periods = np.diff(stamps) / PERIOD_NS
     np.testing.assert_allclose(periods, np.rint(periods), atol=1e-7)
-    missing = int(np.rint(periods - 1).sum())
-    assert missing <= camera.frames_dropped
+    assert np.rint(periods).max() == 1 and camera.frames_dropped == 0  # none is lost where none can be late
     assert section.frame_duration_us == 33_327
 
 
@@ -130,14 +130,14 @@ def test_decoded_pictures_show_the_brick_at_their_stamps(shake: Filmed) -> None:
 def test_every_nth_frame_can_be_dropped() -> None:
     _, sink, _, _ = film(SimSettings(clutter=0.0, faults=SimFaults(drop_frame_every=3)), 9)
     gaps = np.rint(np.diff([p.abs_us for p in sink.packets]) * 1e3 / PERIOD_NS).astype(int)
-    # 1 1 0 1 1 0 leaves gaps of 1 2 1 2; a busy machine may drop more.
-    assert (gaps >= 2).sum() >= 3 and np.count_nonzero((gaps[1:] == 1) & (gaps[:-1] == 1)) == 0
+    # 1 1 0 1 1 0 leaves gaps of 1 2 1 2.
+    assert gaps[:6].tolist() == [1, 2, 1, 2, 1, 2]
 
 
 def test_a_camera_that_dies_says_nothing_and_stops_anyway() -> None:
     settings = SimSettings(clutter=0.0, faults=SimFaults(camera_dies_after_s=0.3))
-    _, sink, _, camera = film(settings, 100, timeout_s=1.0)
-    assert 1 <= len(sink.packets) <= 9
+    _, sink, _, camera = film(settings, 100)
+    assert len(sink.packets) == 9  # 0.3 s are 9.0 periods
     camera.stop()
 
 

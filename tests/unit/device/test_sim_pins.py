@@ -72,7 +72,9 @@ def test_stamps_jitter_as_much_as_told() -> None:
     settings = SimSettings(shake_delay_s=0.02, square_wave_hz=1000.0, clock_ppm=0.0, edge_jitter_us=20.0)
     with listening(settings, 400) as (world, listener, _):
         assert listener.done.wait(5)
-        jitter_us = (listener.rising_ns[:200] - world.edge_times_ns(0, 200)) / 1e3
+        # By the nearest edge, not by number: a computer that stands still misses some.
+        heard_ns, true_ns = np.array(listener.rising_ns[:200]), world.edge_times_ns(0, 2000)
+        jitter_us = np.array([t - true_ns[np.abs(true_ns - t).argmin()] for t in heard_ns]) / 1e3
     assert 16 < jitter_us.std() < 24 and abs(jitter_us.mean()) < 5
 
 

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import pickle
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -161,9 +162,9 @@ def test_edges_have_the_laboratory_s_period_on_the_unit_s_clock() -> None:
     assert edges[-1] - edges[0] == pytest.approx(20_000_800_000, abs=2)
 
 
-def _first_edge_and_pose(settings: SimSettings, epoch: Epoch, queue: "multiprocessing.Queue[object]") -> None:  # type: ignore[type-arg]
+def _first_edge_and_pose(settings: SimSettings, epoch: Epoch, answer: Connection) -> None:
     world = SimWorld(settings, epoch)
-    queue.put((world.first_edge_ns, world.pose(np.array([FIRST_NS + 2_345_678_901]))[1].tolist()))
+    answer.send((world.first_edge_ns, world.pose(np.array([FIRST_NS + 2_345_678_901]))[1].tolist()))
 
 
 @pytest.mark.slow
@@ -172,11 +173,13 @@ def test_another_process_lives_in_the_same_world() -> None:
     epoch = make_epoch()
     world = SimWorld(SETTINGS, epoch)
     world.schedule(ARMED_NS)
-    queue: multiprocessing.Queue[object] = context.Queue()
-    process = context.Process(target=_first_edge_and_pose, args=(SETTINGS, epoch, queue))
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_first_edge_and_pose, args=(SETTINGS, epoch, theirs))
     process.start()
-    found = queue.get(timeout=30)
+    theirs.close()
+    found = ours.recv()  # an end of file where the process ends without an answer
     process.join()
+    ours.close()
     assert found == (FIRST_NS, world.pose(np.array([FIRST_NS + 2_345_678_901]))[1].tolist())
 
 

