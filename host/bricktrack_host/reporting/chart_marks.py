@@ -15,6 +15,9 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 UNITS_PER_PT = 20
 _WORDS_PT = 8.5
 _NOWHERE = np.empty(0)
+_N_WRITTEN = 2048
+_WRITTEN = np.array([str(i) for i in (*range(_N_WRITTEN), *range(-_N_WRITTEN, 0))], dtype=object)
+"""Numbers as text, at their own index, which may be negative: a report holds 200,000, nearly all small."""
 
 ToPage = Callable[[FloatArray, FloatArray], IntArray]
 """From values along x and y to units of the page, shape (n, 2)."""
@@ -136,14 +139,14 @@ class Scatter:
         known = np.isfinite(self.x) & np.isfinite(self.y)
         # A stroke of no length with round ends is a dot; all of them are one path.
         steps = _steps(to_page(self.x[known], self.y[known]))
-        path = _repeated("m%d %dh0", steps)
+        path = _repeated("m%s %sh0", steps)
         opacity = f' stroke-opacity="{self.opacity:g}"' if self.opacity < 1 else ""
         dots = f'<path {_stroke(self.colour, self.size_pt)} stroke-linecap="round"{opacity} d="{path}"/>'
         if self.half is None:
             return dots
         x, y, half = self.x[known], self.y[known], self.half[known]
         from_, to = to_page(x, y - half), to_page(x, y + half)
-        bars = _repeated("M%d %dV%d", np.concatenate([from_, to[:, 1:]], axis=1))
+        bars = _repeated("M%s %sV%s", np.concatenate([from_, to[:, 1:]], axis=1))
         return f'<path {_stroke(self.colour, 0.8)} d="{bars}"/>{dots}'
 
     def swatch(self, x: int, y: int, width: int) -> str:
@@ -332,7 +335,7 @@ def polyline(points: IntArray) -> str:
     steps = np.diff(points, axis=0)
     steps = steps[steps.any(axis=1)]
     u, v = points[0].tolist()
-    return f"M{u} {v}l0 0" if not len(steps) else f"M{u} {v}l{' '.join(map(str, steps.ravel().tolist()))}"
+    return f"M{u} {v}l0 0" if not len(steps) else f"M{u} {v}l{' '.join(_written(steps))}"
 
 
 def _steps(points: IntArray) -> IntArray:
@@ -341,7 +344,16 @@ def _steps(points: IntArray) -> IntArray:
 
 def _repeated(pattern: str, rows: IntArray) -> str:
     """Return a pattern filled in with each row; at once, as there may be ten thousands."""
-    return (pattern * len(rows)) % tuple(rows.ravel().tolist())
+    return (pattern * len(rows)) % tuple(_written(rows))
+
+
+def _written(numbers: IntArray) -> list[str]:
+    """Return all numbers of an array as text, row by row."""
+    flat = numbers.ravel()
+    if flat.size and (flat.min() < -_N_WRITTEN or flat.max() >= _N_WRITTEN):
+        return list(map(str, flat.tolist()))
+    written: list[str] = _WRITTEN[flat].tolist()
+    return written
 
 
 def _runs(known: BoolArray) -> list[slice]:

@@ -127,7 +127,10 @@ def flag_meanings(kind: type[IntFlag]) -> dict[str, str]:
     >>> flag_meanings(LedFlag)["MISSING"]
     'Not found in the picture; its coordinates are NaN.'
     """
-    pairs = re.findall(r'^    ([A-Z_]+) = \d+\n    """(.*?)"""', inspect.getsource(kind), re.M | re.S)
+    # The class alone would be sought by parsing the whole file, which takes longer than a chart.
+    after = Path(inspect.getfile(kind)).read_text(encoding="utf-8").split(f"\nclass {kind.__name__}(")[1]
+    body = re.split(r"\n(?=\S)", after, maxsplit=1)[0]
+    pairs = re.findall(r'^    ([A-Z_]+) = \d+\n    """(.*?)"""', body, re.M | re.S)
     return {name: " ".join(words.split()) for name, words in pairs}
 
 

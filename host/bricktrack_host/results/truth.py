@@ -145,13 +145,14 @@ def compare_with_truth(result: RunResult, truth: TrueMotion) -> TruthComparison:
             true_rest = R_rest[0], t_rest_mm[0]
 
     def compare(source: Source, tracks: dict[str, OpticalTrack | FusedTrack], shown: str) -> None:
-        parts = {kind: _Errors.of(track, truth, shift_ns) for kind, track in tracks.items()}
+        true = {kind: truth.at(track.t_ns - shift_ns) for kind, track in tracks.items()}
+        parts = {kind: _Errors.of(track, *true[kind]) for kind, track in tracks.items()}
         series[source] = ErrorSeries(tracks[shown].t_ns, parts[shown].error, parts[shown].sd)
         masks = {k: _group_masks(tracks[k], k, dropouts_ns, impacts_ns) for k in tracks}
         names = dict.fromkeys(name for m in masks.values() for name in m)
         zeroed = {}
         if result.rest is not None and true_rest is not None:
-            zeroed = {k: _rest_errors(t, truth, result.rest, true_rest, shift_ns) for k, t in tracks.items()}
+            zeroed = {k: _rest_errors(t, *true[k], result.rest, true_rest) for k, t in tracks.items()}
         for name in names:
             chosen = [(k, masks[k][name]) for k in tracks if name in masks[k]]
             if not any(mask.any() for _, mask in chosen):
@@ -183,8 +184,7 @@ class _Errors:
     has_pose: BoolArray
 
     @classmethod
-    def of(cls, track: OpticalTrack | FusedTrack, truth: TrueMotion, shift_ns: int) -> "_Errors":
-        R_true, t_true_mm = truth.at(track.t_ns - shift_ns)
+    def of(cls, track: OpticalTrack | FusedTrack, R_true: FloatArray, t_true_mm: FloatArray) -> "_Errors":
         shift_mm = track.t_camera_brick_mm - t_true_mm
         turn_rad = rvec_from_matrix(np.swapaxes(R_true, -1, -2) @ track.R_camera_brick)
         # The covariance is of [dtheta, dt] with R_true = R Exp(dtheta): minus this error, same size.
@@ -204,13 +204,12 @@ class _Errors:
 
 def _rest_errors(
     track: OpticalTrack | FusedTrack,
-    truth: TrueMotion,
+    R_true: FloatArray,
+    t_true_mm: FloatArray,
     rest: RestPose,
     true_rest: tuple[FloatArray, FloatArray],
-    shift_ns: int,
 ) -> _Errors:
     """Return the errors of displacements from rest, each seen from its own rest pose."""
-    R_true, t_true_mm = truth.at(track.t_ns - shift_ns)
     moved_mm = (track.t_camera_brick_mm - rest.t_camera_rest_mm) @ rest.R_camera_rest
     true_moved_mm = (t_true_mm - true_rest[1]) @ true_rest[0]
     turned = rest.R_camera_rest.T @ track.R_camera_brick
