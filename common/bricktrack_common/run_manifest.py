@@ -167,11 +167,21 @@ def read_manifest(path: Path) -> RunManifest:
     """
     try:
         data = path.read_bytes()
-    except FileNotFoundError as e:
-        raise RunFormatError(f"{path}: no manifest; this is no complete run folder") from e
+    except (FileNotFoundError, NotADirectoryError) as e:
+        raise RunFormatError(f"{path.parent}: {_why_no_run(path.parent)}") from e
     except OSError as e:
         raise RunFormatError(f"{path}: {e.strerror or e}") from e
     return parse_manifest(data, where=str(path))
+
+
+def _why_no_run(folder: Path) -> str:
+    if not folder.exists():
+        return "no such run folder"
+    if folder.is_file():
+        return "a file; expected a run folder"
+    if any(folder.glob(f"*/{MANIFEST_NAME}")):
+        return f"a folder of runs. Name the runs in it, as {folder}/*"
+    return f"no {MANIFEST_NAME}, so no whole run folder. Give one that was pulled or imported"
 
 
 def parse_manifest(data: bytes, *, where: str) -> RunManifest:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from bricktrack_common.errors import ConfigError, RunFormatError
+from bricktrack_common.errors import ConfigError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
 from bricktrack_host.cli._units import fleet_path
 from bricktrack_host.transfer.camera_config import CameraMount
@@ -59,20 +59,10 @@ def run_job(
 
 
 def _unit_of(run: Path, fleet_file: Path | None) -> UnitConfig:
-    unit = _unit_that_recorded(run)
+    unit = read_manifest(run / MANIFEST_NAME).unit
     path = fleet_path(fleet_file)
     if fleet_file is None and not path.exists():
         raise ConfigError(
             f"give --calibration and --layout, or a fleet file that names them for unit '{unit}'"
         )
     return load_fleet(path).select([unit])[0]
-
-
-def _unit_that_recorded(run: Path) -> str:
-    if not run.is_dir():
-        raise RunFormatError(f"{run}: no such run folder")
-    if not (run / MANIFEST_NAME).is_file():
-        raise RunFormatError(
-            f"{run}: no {MANIFEST_NAME}, so no run folder. Give a folder that was pulled or imported"
-        )
-    return read_manifest(run / MANIFEST_NAME).unit

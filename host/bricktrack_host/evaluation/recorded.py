@@ -57,7 +57,7 @@ def read_positions(path: Path) -> ReferencePositions:
             reader = csv.DictReader(file)
             header, rows = list(reader.fieldnames or ()), list(reader)
     except (OSError, UnicodeDecodeError) as e:
-        raise ConfigError(f"{path}: cannot be read as CSV: {e}") from e
+        raise ConfigError(f"{path}: cannot be read as CSV: {getattr(e, 'strerror', e)}") from e
     refuse_other_separator(path, header)
     refuse_longer_rows(path, rows)
     wanted = ("start_s", "end_s", *_POSITION)

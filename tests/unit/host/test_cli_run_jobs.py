@@ -17,8 +17,17 @@ def elsewhere(tmp_path, monkeypatch):
 def test_a_folder_that_is_not_there_or_no_run_is_named_before_a_calibration_is_asked_for(tmp_path):
     with pytest.raises(RunFormatError, match="gone: no such run folder"):
         run_job(tmp_path / "gone", fleet_file=None)
-    with pytest.raises(RunFormatError, match=r"no manifest\.json, so no run folder"):
+    with pytest.raises(RunFormatError, match=r"no manifest\.json, so no whole run folder"):
         run_job(tmp_path, fleet_file=None)
+    (tmp_path / "notes.txt").write_text("none")
+    with pytest.raises(RunFormatError, match=r"notes\.txt: a file; expected a run folder"):
+        run_job(tmp_path / "notes.txt", fleet_file=None)
+
+
+def test_a_folder_of_runs_is_told_from_a_run(tmp_path):
+    make_run(tmp_path / "runs", "b2_0001_shake", {"video.h264": 10})
+    with pytest.raises(RunFormatError, match=r"runs: a folder of runs\. Name the runs in it, as .*runs/\*"):
+        run_job(tmp_path / "runs", fleet_file=None)
 
 
 def test_a_run_without_calibration_is_told_its_unit(tmp_path):
