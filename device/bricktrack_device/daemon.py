@@ -26,6 +26,8 @@ from bricktrack_device.watchdog import Watchdog
 logger = logging.getLogger(__name__)
 
 WATCHDOG_PERIOD_S = 1.0
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""The last one comes when the terminal goes from which a daemon was started by hand: a lost SSH line."""
 
 
 class Daemon:
@@ -49,7 +51,7 @@ class Daemon:
         self._stop.set()
 
     def run(self) -> None:
-        """Serve until told to stop by SIGTERM, SIGINT or `stop`; then save what is under way.
+        """Serve until told to stop by SIGTERM, SIGINT, SIGHUP or `stop`; then save what is under way.
 
         Raises
         ------
@@ -71,7 +73,7 @@ class Daemon:
             for run_id in store.recover(rebuild_manifest):
                 logger.warning("%s: recovered after a cut while it was being saved", run_id)
             if threading.current_thread() is threading.main_thread():
-                for number in (signal.SIGTERM, signal.SIGINT):
+                for number in STOP_SIGNALS:
                     signal.signal(number, self.stop)
             service.health.refresh_if_due(recorder.state)
             notify("STATUS=trying the sensors")

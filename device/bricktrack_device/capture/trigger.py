@@ -83,6 +83,7 @@ class Trigger:
         self._n_out_of_order = 0
         self._n_off_clock = 0
         self._worst_off_ns = 0
+        self._bug = ""
         try:
             pull_up, active = {"down": (False, None), "up": (True, None), "none": (None, True)}[settings.pull]
             self._device = gpiozero.DigitalInputDevice(
@@ -146,6 +147,8 @@ class Trigger:
             words += f"; an edge {(now - provisional) / 1e9:.1f} s ago waits for others in step"
         if n_rejected:
             words += f"; {n_rejected} edges did not count"
+        if self._bug:
+            words += f"; edges were lost: internal error: {self._bug}"
         return words
 
     def arm(self, on_first_edge: Callable[[], None]) -> int:
@@ -167,6 +170,7 @@ class Trigger:
             self._finder = self._new_finder()
             self._newest_rising_ns = 0
             self._n_out_of_order = self._n_off_clock = self._worst_off_ns = 0
+            self._bug = ""
             return now
 
     def disarm(self) -> EdgeTrain:
@@ -201,14 +205,27 @@ class Trigger:
                 f"trigger: {self._n_off_clock} edges have stamps up to {self._worst_off_ns / 1e9:.3f} s off "
                 "CLOCK_MONOTONIC and were left out; kernel 5.7 or newer and the lgpio factory are needed"
             )
+        if self._bug:
+            problems.append(f"trigger: edges were lost: internal error: {self._bug}")
         if len(self._edges_ns) >= MAX_EDGES:
             problems.append(f"trigger: only the first {MAX_EDGES} edges were kept")
         finder = self._finder
         return EdgeTrain(self._t0_ns, list(self._edges_ns), finder.n_rejected, problems, finder.rejected_ns)
 
     def _on_change(self, ticks_s: float, state: int) -> None:
-        """Take one change of the line; called by gpiozero, in the pin's thread."""
-        t_ns = round(ticks_s * 1e9)
+        """Take one change of the line; called by gpiozero, in the pin's thread.
+
+        Nothing is raised here: lgpio has one thread for all its calls, and an error ends it. No edge would be
+        heard any more, in this run and all later ones.
+        """
+        try:
+            self._take_change(round(ticks_s * 1e9), state)
+        except Exception as e:
+            if not self._bug:
+                logger.exception("trigger: a bug; edges are lost")
+            self._bug = f"{type(e).__name__}: {e}"
+
+    def _take_change(self, t_ns: int, state: int) -> None:
         first_edge = None
         with self._lock:
             if self._armed_ns is None:

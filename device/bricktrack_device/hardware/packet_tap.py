@@ -7,8 +7,17 @@ word: the encoder still says that it runs, and stopping waits for ever. So nothi
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from bricktrack_common.clocks import monotonic_ns
 from bricktrack_device.hardware.camera_checks import FrameReport, read_report
 from bricktrack_device.interfaces import EncodedPacket, FrameMetadata, FrameSink
+
+_MAX_AHEAD_NS = 5_000_000
+
+
+def _refuse_future(stamp_ns: int, now_ns: int) -> None:
+    """Raise on a stamp that cannot be: one far ahead would push every picture before it out of the ring."""
+    if stamp_ns > now_ns + _MAX_AHEAD_NS:
+        raise ValueError(f"a frame's stamp lies {(stamp_ns - now_ns) / 1e6:.1f} ms in the future")
 
 
 class TimedEncoder(Protocol):
@@ -31,9 +40,12 @@ class PacketTap:
         Why the last one was not.
     """
 
-    def __init__(self, encoder: TimedEncoder, sink: FrameSink) -> None:
+    def __init__(
+        self, encoder: TimedEncoder, sink: FrameSink, *, clock: Callable[[], int] = monotonic_ns
+    ) -> None:
         self._encoder = encoder
         self._sink = sink
+        self._clock = clock
         self.n_packets = 0
         self.n_failed = 0
         self.last_error: Exception | None = None
@@ -44,7 +56,9 @@ class PacketTap:
             first_us = self._encoder.firsttimestamp
             if first_us is None or timestamp_us is None:
                 raise ValueError("the encoder gave a packet without a time stamp")
-            self._sink.on_packet(EncodedPacket(first_us + timestamp_us, bool(keyframe), bytes(data)))
+            abs_us = first_us + timestamp_us
+            _refuse_future(abs_us * 1000, self._clock())
+            self._sink.on_packet(EncodedPacket(abs_us, bool(keyframe), bytes(data)))
             self.n_packets += 1
         except Exception as e:  # noqa: BLE001  see the module's first lines
             self.n_failed += 1
@@ -106,6 +120,7 @@ class MetadataTap:
         try:
             arrival_ns = self._clock()
             report = read_report(request.get_metadata(), arrival_ns)
+            _refuse_future(report.sensor_timestamp_ns, arrival_ns)
             self._sink.on_metadata(
                 FrameMetadata(
                     sensor_timestamp_ns=report.sensor_timestamp_ns,

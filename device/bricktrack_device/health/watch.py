@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from bricktrack_common.wire_messages import DaemonState, HealthItem
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health import machine, storage
-from bricktrack_device.health.findings import CheckResult, tried
+from bricktrack_device.health.findings import CheckResult, tried, warning
 from bricktrack_device.health.inertial import check_adapter
 from bricktrack_device.health.self_test import run_self_test
 from bricktrack_device.interfaces import Rig
@@ -67,7 +67,13 @@ class HealthWatch:
         if self._found is not None and now - self._found[0] < self._period_s:
             return False
         before = {} if self._found is None else {r.name: r.level for r in self._found[1]}
-        results = self._look()
+        try:
+            results = self._look()
+        except Exception as e:
+            # The daemon's own thread calls this, and a run may begin meanwhile: it must go on.
+            logger.exception("a bug in the health checks")
+            words = f"internal error: {type(e).__name__}: {e}"
+            results = [warning("health", words, "Report it, with the daemon's log")]
         self._found = now, results
         _tell(r for r in results if before.get(r.name) != r.level)
         return True

@@ -91,8 +91,9 @@ class SamplerFailed:
 
 def sampler_main(job: SamplerJob, connection: Connection) -> None:
     """Run one sampler until it is told to stop or its parent is gone; the entry point of its process."""
-    # Ctrl-C reaches the whole process group; the daemon decides when sampling ends.
+    # Both reach the whole process group; the daemon decides when sampling ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     if os.getppid() != job.parent_pid:
         return  # killed while this process began; nobody waits for samples, and its memory may be gone
     buffer = SampleBuffer(job.buffer_capacity, job.buffer_name)

@@ -36,22 +36,23 @@ class Advertisement:
         if ipaddress.ip_address(self._address).is_loopback:
             return
         try:
-            import zeroconf
+            at_low_priority(self._register)
         except ImportError:
             logger.info("not announced in the network: zeroconf is not installed")
-            return
-        try:
-            at_low_priority(self._register)
-        except (zeroconf.Error, OSError, EOFError) as e:
+        except Exception as e:  # noqa: BLE001  as in `stop`
             logger.warning("not announced in the network: %s: %s", type(e).__name__, e)
             self.stop()
 
     def stop(self) -> None:
         """Take the announcement back. Calling it twice does no harm."""
         opened, self._zeroconf = self._zeroconf, None
-        if opened is not None:
+        if opened is None:
+            return
+        try:
             opened.unregister_all_services()
             opened.close()
+        except Exception as e:  # noqa: BLE001  whatever it is, a unit goes on and comes to its end without
+            logger.warning("the announcement was not taken back: %s: %s", type(e).__name__, e)
 
     def _register(self) -> None:
         import zeroconf

@@ -78,6 +78,19 @@ def test_a_packet_without_a_time_is_not_handed_on() -> None:
     assert (sink.packets, tap.n_failed) == ([], 2)
 
 
+def test_a_stamp_in_the_future_is_refused_because_it_would_empty_the_ring() -> None:
+    sink = Sink()
+    packets = PacketTap(Encoder(), sink, clock=lambda: 7_040_000_000)
+    for timestamp_us in (0, 33_327, 3_600_000_000, 39_000):
+        packets.take(b"a", True, timestamp_us)
+    assert [p.abs_us for p in sink.packets] == [7_000_000, 7_033_327, 7_039_000]
+    assert packets.n_failed == 1 and "3599960.0 ms in the future" in str(packets.last_error)
+    metadata = MetadataTap(sink, clock=lambda: 150_000_000)
+    metadata(Request(SensorTimestamp=156_000_000))
+    metadata(Request(SensorTimestamp=149_000_000))
+    assert [m.sensor_timestamp_ns for m in sink.metadata] == [149_000_000] and metadata.n_failed == 1
+
+
 def test_metadata_are_handed_on_with_what_a_run_keeps() -> None:
     sink = Sink()
     heard = []
@@ -85,15 +98,15 @@ def test_metadata_are_handed_on_with_what_a_run_keeps() -> None:
     tap.on_report = heard.append
     tap(Request(Lux=3.0))
     tap.on_report = None
-    tap(Request(SensorTimestamp=156_000_000))
+    tap(Request(SensorTimestamp=148_000_000))
     assert sink.metadata[0] == FrameMetadata(123_456_789, 1984, 1.0, 33326)
     assert [r.arrival_ns for r in heard] == [150_000_000]
-    assert (tap.n_frames, tap.newest_ns) == (2, 156_000_000)
+    assert (tap.n_frames, tap.newest_ns) == (2, 148_000_000)
 
 
 def test_an_error_in_the_metadata_stays_out_of_the_cameras_thread() -> None:
     sink = Sink()
-    tap = MetadataTap(sink, clock=lambda: 0)
+    tap = MetadataTap(sink, clock=lambda: 150_000_000)
     tap(Request(ExposureTime="none"))
     sink.error = RuntimeError("sink")
     tap(Request())

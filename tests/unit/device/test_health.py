@@ -258,3 +258,17 @@ def test_saturated_leds_of_a_simulated_unit_are_told_by_its_check(
     finally:
         rig.close()
     assert found["exposure"].level == level and words in found["exposure"].detail
+
+
+def test_a_bug_in_a_check_is_a_finding_and_does_not_end_the_daemon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def break_down(path: Path | None = None) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(machine, "check_temperature", break_down)
+    config = DeviceConfig(storage=StorageTable(folder=str(tmp_path)))
+    watch = HealthWatch(config, FakeRig())
+    assert watch.refresh_if_due("idle")
+    (item,) = watch.items
+    assert item.level == "warn" and "ZeroDivisionError: a bug" in item.words

@@ -4,6 +4,7 @@ import pytest
 from gpiozero.pins.mock import MockFactory, MockPin
 
 from bricktrack_common.errors import HardwareError
+from bricktrack_device.capture.first_edge import FirstEdgeFinder
 from bricktrack_device.capture.trigger import Trigger
 from bricktrack_device.config import TriggerTable
 
@@ -213,3 +214,22 @@ def test_a_line_that_is_stuck_low_stays_armed_and_says_how_long() -> None:
     assert "an edge 2.0 s ago waits for others in step" in line.trigger.waiting_words()
     wave(line, line.now_ns, 3)
     assert line.trigger.waiting_words() == ""
+
+
+def test_an_error_never_reaches_the_pins_thread_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(nominal_hz=50.0)
+    t = line.arm()
+    line.edge(t + 10 * MS, 1)
+
+    def break_down(self: FirstEdgeFinder, *args: object, **more: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FirstEdgeFinder, "take", break_down)
+        line.edge(t + 20 * MS, 1)  # would end lgpio's thread
+        assert "edges were lost: internal error: ZeroDivisionError" in line.trigger.waiting_words()
+    for k in (1, 2, 3):
+        line.edge(t + (10 + 20 * k) * MS, 1)
+    train = line.trigger.disarm()
+    assert train.t0_ns == t + 10 * MS and len(train.edges_ns) == 4
+    assert train.problems == ["trigger: edges were lost: internal error: ZeroDivisionError: a bug"]
