@@ -10,7 +10,7 @@ from math import ceil, floor, hypot, nan, sqrt
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled, compiled_in_place
 from bricktrack_host.tracking.pictures.lit_pixels import Bytes, Columns, light_near, near_others, widened
 
 SHARE_LOW = 0.15
@@ -194,26 +194,26 @@ def _moments(
     x0, y0, x1, y1 = part
     weight_of = np.minimum(np.maximum((share - SHARE_LOW) / (SHARE_HIGH - SHARE_LOW), 0.0), 1.0)
     middle_x, middle_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
+    low, high = 256, -1  # the codes of a rim
+    for code in range(256):
+        if 0.0 < weight_of[code] < 1.0:
+            low, high = min(low, code), max(high, code)
     area, sum_x, sum_y, sum_xx, sum_xy, sum_yy, n_rim = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
     for j in range(y1 - y0):
         at = (v0 + y0 + j) * stride + u0
-        row = luma[at + first[j] : at + last[j] + 1]
-        row_area, row_x, row_xx, dy = 0.0, 0.0, 0.0, j - middle_y
-        for i in range(len(row)):
-            x = first[j] - x0 + i
-            if others.size and others[j, x]:
-                continue
-            weight, dx = weight_of[row[i]], x - middle_x
-            row_area += weight
-            row_x += weight * dx
-            row_xx += weight * dx * dx
-            n_rim += 0.0 < weight < 1.0
+        row, dx, dy = luma[at + first[j] : at + last[j] + 1], first[j] - x0 - middle_x, j - middle_y
+        beside = others[j, first[j] - x0 : last[j] + 1 - x0] if others.size else others[:0, 0]
+        if _is_any(beside):
+            row_area, row_x, row_xx, n = _sums_without(row, beside, weight_of, dx, low, high)
+        else:
+            row_area, row_x, row_xx, n = _sums(row, weight_of, dx, low, high)
         area += row_area
         sum_x += row_x
         sum_y += row_area * dy
         sum_xx += row_xx
         sum_xy += row_x * dy
         sum_yy += row_area * dy * dy
+        n_rim += n
     if area < 3.0:
         return
     mean_x, mean_y = sum_x / area, sum_y / area
@@ -222,10 +222,6 @@ def _moments(
     half_trace, root = 0.5 * (xx + yy), hypot(0.5 * (xx - yy), xy)
     large, small = max(half_trace + root, 1e-9), max(half_trace - root, 1e-9)
     noise = float(size)
-    low, high = 256, -1
-    for code in range(256):
-        if 0.0 < weight_of[code] < 1.0:
-            low, high = min(low, code), max(high, code)
     if high >= 0:
         low, high = max(low - 1, 0), min(high + 1, 255)
         slope = (weight_of[high] - weight_of[low]) / (high - low) * NOISE_CODES
@@ -238,3 +234,45 @@ def _moments(
     out[AREA] = area
     out[ECCENTRICITY] = sqrt(max(1.0 - small / large, 0.0))
     out[FILL] = area / (4.0 * np.pi * sqrt(large * small))
+
+
+@compiled_in_place
+def _is_any(marks: Bytes) -> bool:
+    n = 0
+    for i in range(len(marks)):
+        n += marks[i]
+    return n > 0
+
+
+@compiled_in_place
+def _sums(
+    row: Bytes, weight_of: FloatArray, dx: float, low: int, high: int
+) -> tuple[float, float, float, int]:
+    """Return a row's sums of weights, times dx and its square, dx growing by 1, and its pixels of the rim."""
+    row_area, row_x, row_xx, n_rim = 0.0, 0.0, 0.0, 0
+    for i in range(len(row)):
+        weight = weight_of[row[i]]
+        row_area += weight
+        row_x += weight * dx
+        row_xx += weight * dx * dx
+        dx += 1.0
+    for i in range(len(row)):
+        n_rim += low <= row[i] <= high
+    return row_area, row_x, row_xx, n_rim
+
+
+@compiled_in_place
+def _sums_without(
+    row: Bytes, beside: Bytes, weight_of: FloatArray, dx: float, low: int, high: int
+) -> tuple[float, float, float, int]:
+    """Return what `_sums` does, of pixels that are not marked."""
+    row_area, row_x, row_xx, n_rim = 0.0, 0.0, 0.0, 0
+    for i in range(len(row)):
+        if not beside[i]:
+            weight = weight_of[row[i]]
+            row_area += weight
+            row_x += weight * dx
+            row_xx += weight * dx * dx
+            n_rim += low <= row[i] <= high
+        dx += 1.0
+    return row_area, row_x, row_xx, n_rim

@@ -8,7 +8,7 @@ from math import hypot, inf, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled, compiled_in_place, compiled_inline
 
 Bytes = NDArray[np.uint8]
 Columns = NDArray[np.int64]
@@ -47,54 +47,109 @@ def light_near(
     """
     first, last = np.empty(v1 - v0, dtype=np.int64), np.empty(v1 - v0, dtype=np.int64)
     mask = np.empty((0, 0), dtype=np.uint8)
-    x, y, w, h, n_pixels = _only_light(luma, stride, u0, v0, u1, v1, cut, first, last)
-    if n_pixels < 0:
-        n_pixels = 0
+    i, j = min(max(round(near_u), 0), u1 - u0 - 1), min(max(round(near_v), 0), v1 - v0 - 1)
+    x, y, w, h, n_pixels = _traced(luma, stride, u0, v0, u1, v1, cut, i, j, first, last)
+    if n_pixels == 0:
         mask = _lit_mask(luma, stride, u0, v0, u1, v1, cut)
         stack = stack_for(mask)
         seed = _seed_near(mask, stack, near_u, near_v)
         if seed >= 0:
             x, y, w, h, n_pixels, _, _ = fill_component(mask, stack, seed, LIT, OWN)
             _spans_of_own(mask, x, y, w, h, first, last)
+            if not _holds(mask, LIT):
+                mask = np.empty((0, 0), dtype=np.uint8)
+    elif _n_lit_of_window(luma, stride, u0, v0, u1, v1, cut) > n_pixels:
+        mask = _lit_mask(luma, stride, u0, v0, u1, v1, cut)
+        for k in range(y, y + h):
+            mask[k, first[k] : last[k] + 1] = OWN
     return x, y, w, h, n_pixels, first, last, mask
 
 
-@compiled
-def _only_light(
-    luma: Bytes, stride: int, u0: int, v0: int, u1: int, v1: int, cut: np.uint8, first: Columns, last: Columns
+@compiled_in_place
+def _traced(
+    luma: Bytes,
+    stride: int,
+    u0: int,
+    v0: int,
+    u1: int,
+    v1: int,
+    cut: np.uint8,
+    i: int,
+    j: int,
+    first: Columns,
+    last: Columns,
 ) -> tuple[int, int, int, int, int]:
-    """Return box x, y, w, h and pixels of what is lit in a window, if it is one run a row, each at the next.
+    """Return box x, y, w, h and pixels of the light around a pixel of a window, if it is one run a row.
 
-    No pixels: nothing is lit; -1: more than that is lit. Fills in the runs' first and last columns, row by
-    row; where there is none, first beyond last.
+    No pixels: the pixel or one beside it is dark, or the light forks. Fills in the runs' first and last
+    columns, row by row; where there is none, first beyond last.
     """
-    width = u1 - u0
-    x0, y0, x1, y1, n_pixels = width, -1, -1, -1, 0
-    for j in range(v1 - v0):
-        at = (v0 + j) * stride
-        row = luma[at + u0 : at + u1]
-        n_lit = 0
-        for i in range(width):
-            n_lit += row[i] >= cut
-        first[j], last[j] = width, -1
-        if n_lit == 0:
-            continue
-        begin = 0
-        while row[begin] < cut:
-            begin += 1
-        end = begin + n_lit
-        if row[end - 1] < cut:
-            return 0, 0, 0, 0, -1
-        for i in range(begin, end):
-            if row[i] < cut:
-                return 0, 0, 0, 0, -1
-        first[j], last[j] = begin, end - 1
-        if y0 < 0:
-            y0 = j
-        elif y1 != j - 1 or begin > last[j - 1] + 1 or end < first[j - 1]:
-            return 0, 0, 0, 0, -1
-        x0, x1, y1, n_pixels = min(x0, begin), max(x1, end - 1), j, n_pixels + n_lit
+    width, height = u1 - u0, v1 - v0
+    first[:], last[:] = width, -1
+    for k in range(max(j - 1, 0), min(j + 2, height)):
+        at = (v0 + k) * stride + u0
+        for m in range(max(i - 1, 0), min(i + 2, width)):
+            if luma[at + m] < cut:
+                return 0, 0, 0, 0, 0
+    at = (v0 + j) * stride + u0
+    first[j], last[j] = _ends_of_run(luma[at : at + width], i, i, cut)
+    y0, y1, n_pixels = j, j, last[j] - first[j] + 1
+    for step in (-1, 1):
+        k = j + step
+        while 0 <= k < height:
+            at, at_before = (v0 + k) * stride + u0, (v0 + k - step) * stride + u0
+            row, before = luma[at : at + width], luma[at_before : at_before + width]
+            from_, to = max(first[k - step] - 1, 0), min(last[k - step] + 1, width - 1)
+            begin, end = _ends_of_run(row, from_, to, cut)
+            if begin > end:
+                break
+            n = _n_lit(row[begin : end + 1], cut)
+            # Another run of this row meets the run before, or another one of that row meets this run.
+            beside = _n_lit(before[max(begin - 1, 0) : from_], cut) + _n_lit(before[to + 1 : end + 2], cut)
+            if n < end - begin + 1 or beside > 0:
+                return 0, 0, 0, 0, 0
+            first[k], last[k] = begin, end
+            y0, y1, n_pixels = min(y0, k), max(y1, k), n_pixels + n
+            k += step
+    x0, x1 = width, -1
+    for k in range(y0, y1 + 1):
+        x0, x1 = min(x0, first[k]), max(x1, last[k])
     return x0, y0, x1 - x0 + 1, y1 - y0 + 1, n_pixels
+
+
+@compiled_inline
+def _ends_of_run(row: Bytes, from_: int, to: int, cut: np.uint8) -> tuple[int, int]:
+    """Return where what is lit from one column to another begins and ends; the end first if nothing is."""
+    begin, end = from_, to
+    if row[begin] >= cut:
+        while begin > 0 and row[begin - 1] >= cut:
+            begin -= 1
+    else:
+        while begin <= to and row[begin] < cut:
+            begin += 1
+    if row[end] >= cut:
+        while end < len(row) - 1 and row[end + 1] >= cut:
+            end += 1
+    else:
+        while end >= from_ and row[end] < cut:
+            end -= 1
+    return begin, end
+
+
+@compiled_inline
+def _n_lit(row: Bytes, cut: np.uint8) -> int:
+    n = 0
+    for i in range(len(row)):
+        n += row[i] >= cut
+    return n
+
+
+@compiled_in_place
+def _n_lit_of_window(luma: Bytes, stride: int, u0: int, v0: int, u1: int, v1: int, cut: np.uint8) -> int:
+    n = 0
+    for v in range(v0, v1):
+        n += _n_lit(luma[v * stride + u0 : v * stride + u1], cut)
+    return n
 
 
 @compiled
@@ -223,26 +278,21 @@ def near_others(mask: Bytes, reach: int) -> Bytes:
     if not _holds(mask, LIT):
         return np.empty((0, 0), dtype=np.uint8)
     rows, columns = mask.shape
-    wide = np.zeros((rows, columns), dtype=np.uint8)
+    out = np.zeros((rows, columns), dtype=np.uint8)
     for j in range(rows):
-        filled_to = 0
-        for i in range(columns):
-            if mask[j, i] == LIT:
-                to = min(i + reach + 1, columns)
-                for ii in range(max(i - reach, filled_to), to):
-                    wide[j, ii] = 1
-                filled_to = to
-    out = np.empty((rows, columns), dtype=np.uint8)
-    rows_since = np.full(columns, reach + 1, dtype=np.int32)  # a marked one: downwards, then upwards
+        end = 0
+        while _holds(mask[j : j + 1, end:], LIT):
+            begin = end
+            while mask[j, begin] != LIT:
+                begin += 1
+            end = begin
+            while end < columns and mask[j, end] == LIT:
+                end += 1
+            for jj in range(max(j - reach, 0), min(j + reach + 1, rows)):
+                out[jj, max(begin - reach, 0) : min(end + reach, columns)] = 1
     for j in range(rows):
         for i in range(columns):
-            rows_since[i] = 0 if wide[j, i] else rows_since[i] + 1
-            out[j, i] = rows_since[i] <= reach
-    rows_since[:] = reach + 1
-    for j in range(rows - 1, -1, -1):
-        for i in range(columns):
-            rows_since[i] = 0 if wide[j, i] else rows_since[i] + 1
-            out[j, i] = (out[j, i] or rows_since[i] <= reach) and mask[j, i] != OWN
+            out[j, i] &= mask[j, i] != OWN
     return out
 
 
