@@ -73,7 +73,7 @@ def dashboard(
     lab = None if chosen.fleet is None else fleet_path(fleet).resolve().parent
 
     def ready(url: str) -> None:
-        out.print(f"control page of {len(chosen.units)} units: {url}", markup=False, soft_wrap=True)
+        out.print(f"control page: {url}", markup=False, soft_wrap=True)
         err.print("Ctrl-C ends it; the units stay as they are", style="dim")
 
     serve(
