@@ -163,5 +163,4 @@ def test_a_signal_during_a_recording_saves_it_as_interrupted(
     run = read_run(tmp_path / "storage" / "runs" / armed.run_id, verify_hashes=True)
     assert run.manifest.state == "interrupted" and run.frames is not None and run.frames.n_frames > 5
     assert any("the daemon was stopped" in words for words in run.manifest.missing)
-    _, samples = run.imus["brick"]
-    assert run.manifest.quality.imu_slots - samples.t_ns.size < 20  # the sampler went on until it was told
+    assert not any("died" in words for words in run.manifest.missing)  # samplers end when they are told
