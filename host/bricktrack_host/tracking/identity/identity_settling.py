@@ -34,6 +34,7 @@ _LEAST_GATE_PX = 0.5  # what calibration and profile may leave, beside centroid 
 _LEAST_USUAL_PX = 0.1  # usual residuals of few LEDs are small by chance
 _LEAST_TURN_RAD = 0.01  # off the cubic through its neighbours; a 2 degree shake at 6 Hz is 0.011 off
 _MOST_TURN_RAD = 0.1  # no shaken brick's, where its run is smooth
+_ENOUGH_OTHERS = MIN_INLIERS + 2  # agree by no chance, whatever light is left out beside them
 _SAME_TURN = 0.7  # share of a turn that is left without any one LED where it is the brick that turned
 _NEAR_TURNS = 31
 _WARM_ROUNDS, _SETTLE_ROUNDS = 2, 3
@@ -99,6 +100,12 @@ def _settle_rounds(run: RunIdentities) -> FloatArray:
             unknown = unknown_motion(some.uv_px, run.ray_model)
             again = _verify_known(run, frames[bad], some, motion, usual_gate, within=unknown)
             fits = is_whole(again, some) & (scatter_px(again) <= tight[bad])
+            verified = verified.replaced(bad[fits], again.take(np.flatnonzero(fits)))
+            good[bad[fits]] = True
+        bad = np.flatnonzero(~good)
+        if bad.size:  # what a card leaves of an LED lies where no pose has it: the others count
+            again = _verify_known(run, frames[bad], lights.take(bad), motion, usual_gate, intruders=True)
+            fits = (again.kept.sum(axis=1) >= _ENOUGH_OTHERS) & (scatter_px(again) <= tight[bad])
             verified = verified.replaced(bad[fits], again.take(np.flatnonzero(fits)))
             good[bad[fits]] = True
         run.take(frames, assigned, verified, good)
