@@ -3,8 +3,6 @@
 import json
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,14 +13,13 @@ import pyarrow.compute as pc
 import pyarrow.dataset
 import pyarrow.parquet as pq
 import pytest
-from small_lab import BRICK, UNITS, invented_run
+from campaign_lab import combine, files_of, make_campaign, make_lab, rows_of
+from small_lab import UNITS
 from typer.testing import CliRunner
 
-from bricktrack_common.errors import ConfigError, RunFormatError, StorageError
+from bricktrack_common.errors import ConfigError, RunFormatError
 from bricktrack_host.assemblies.combined_summary import read_components
-from bricktrack_host.assemblies.combined_test import combine_test
 from bricktrack_host.cli.main import app
-from bricktrack_host.datasets import campaign_dataset, campaign_folder
 from bricktrack_host.datasets.campaign_dataset import add_units, list_units, open_dataset
 from bricktrack_host.datasets.motion_schema import COLUMNS, MOTION_VERSION, columns_of, motion_schema
 from bricktrack_host.datasets.test_sources import source_of_run, sources_of_test
@@ -33,43 +30,12 @@ DOCS = Path(__file__).parents[3] / "docs"
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """Two runs of one shake and their combined test (invented, simulated)."""
-    folder = tmp_path_factory.mktemp("lab")
-    for unit in UNITS:
-        invented_run(folder / unit, unit)
-    combine(folder)
-    return folder
-
-
-def combine(folder, name="shake-12"):
-    results = {unit: folder / unit / "results" for unit in UNITS}
-    combine_test(name, results, [BRICK], folder / name)
+    return make_lab(tmp_path_factory.mktemp("lab"))
 
 
 @pytest.fixture(scope="module")
 def campaign(lab, tmp_path_factory):
-    root = tmp_path_factory.mktemp("data") / "campaign"
-    add_units(root, sources_of_test(lab / "shake-12"), whole_tests=True)
-    return root
-
-
-@pytest.fixture(scope="module")
-def slipped(lab, tmp_path_factory):
-    """The same, with sample numbers of units that missed three edges."""
-    root = tmp_path_factory.mktemp("data") / "campaign"
-    sources = [
-        replace(s, slip_samples=3, sample_agreement="corrected") for s in sources_of_test(lab / "shake-12")
-    ]
-    add_units(root, sources, whole_tests=True)
-    return root
-
-
-def files_of(root):
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
-
-
-def rows_of(root, **kwargs):
-    return open_dataset(root, **kwargs).to_table()
+    return make_campaign(lab, tmp_path_factory.mktemp("data") / "campaign")
 
 
 def test_rows_seen_from_the_camera_are_those_of_the_run(lab, campaign):
@@ -111,8 +77,10 @@ def test_only_what_was_measured_is_called_so(campaign):
     assert 0 < measured.sum() < len(measured)
 
 
-def test_the_slip_of_a_unit_is_in_its_sample_numbers(slipped):
-    rows = rows_of(slipped).filter((pc.field("seen_from") == "camera") & (pc.field("kind") == "edge"))
+def test_the_slip_of_a_unit_is_in_its_sample_numbers(lab, tmp_path):
+    rows = rows_of(make_campaign(lab, tmp_path / "campaign", slip_samples=3)).filter(
+        (pc.field("seen_from") == "camera") & (pc.field("kind") == "edge")
+    )
     assert rows.column("sample")[0].as_py() == 3.0
     assert set(rows.column("sample_agreement").to_pylist()) == {"corrected"}
 
@@ -183,102 +151,6 @@ def test_a_test_that_is_older_than_its_runs_is_refused(lab, tmp_path):
         sources_of_test(tmp_path / "shake-12")
 
 
-@pytest.fixture(scope="module")
-def rows_made():
-    """Rows by what they were made of: the tests of kills need not make them again and again."""
-    return {}
-
-
-@pytest.fixture
-def quick_rows(rows_made, monkeypatch):
-    made = campaign_dataset.unit_rows
-
-    def unit_rows(source, source_id):
-        if source_id not in rows_made:
-            rows_made[source_id] = made(source, source_id)
-        return rows_made[source_id]
-
-    monkeypatch.setattr(campaign_dataset, "unit_rows", unit_rows)
-
-
-class Killed(BaseException):
-    """Ends a command at once, as SIGKILL does: nothing catches it, and adding has nothing to clean up."""
-
-
-@pytest.mark.usefixtures("quick_rows")
-@pytest.mark.parametrize("call", [1, 2])
-@pytest.mark.parametrize("step", ["unit_rows", "rename_durably", "_finish", "_keep", "_sync_up"])
-def test_a_kill_at_any_step_leaves_the_dataset_as_before_or_as_after(
-    lab, campaign, slipped, tmp_path, monkeypatch, step, call
-):
-    root = tmp_path / "campaign"
-    shutil.copytree(slipped, root)
-    sources = sources_of_test(lab / "shake-12")
-    before, after = (rows_of(folder).column("sample").to_numpy() for folder in (slipped, campaign))
-    module = campaign_dataset if step == "unit_rows" else campaign_folder
-    real, calls = getattr(module, step), []
-
-    def dies(*words, **options):
-        calls.append(1)
-        if len(calls) == call:
-            raise Killed
-        return real(*words, **options)
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(module, step, dies)
-        add_units(root, sources, whole_tests=True)
-    # Adding begins with a call of _finish; its first rename decides, its second keeps what was there before.
-    is_decided = step in ("_keep", "_sync_up") or (step, call) in (("_finish", 2), ("rename_durably", 2))
-    found = rows_of(root).column("sample").to_numpy()
-    np.testing.assert_array_equal(found, after if is_decided else before)
-    add_units(root, sources, whole_tests=True)
-
-    def current(folder):
-        return {name: data for name, data in files_of(folder).items() if name.startswith("motion")}
-
-    assert current(root) == current(campaign)
-    assert len(list((root / "earlier").rglob("*.parquet"))) == 2
-    assert {p.name for p in root.iterdir()} == {"dataset.json", "motion", "earlier"}
-
-
-@pytest.mark.usefixtures("quick_rows")
-@pytest.mark.parametrize("step", ["write_durably", "rename_durably", "rmtree"])
-def test_a_kill_while_a_dataset_is_made_or_tidied_up_does_not_lock_it(lab, tmp_path, monkeypatch, step):
-    root = tmp_path / "campaign"
-    sources = sources_of_test(lab / "shake-12")[:1]
-
-    def dies(path, *_):
-        if step == "write_durably":
-            path.write_bytes(b"half a mark")
-        elif step == "rmtree":
-            (path / "retire.json").unlink()
-        raise Killed
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(campaign_folder.shutil if step == "rmtree" else campaign_folder, step, dies)
-        add_units(root, sources, whole_tests=True)
-    done = add_units(root, sources, whole_tests=True)
-    assert done.unchanged if step == "rmtree" else done.added
-    assert {p.name for p in root.iterdir()} == {"dataset.json", "motion"}
-
-
-def test_a_process_that_is_killed_frees_the_dataset(lab, campaign, tmp_path):
-    root = tmp_path / "campaign"
-    shutil.copytree(campaign, root)
-    code = (
-        "import os, sys; from pathlib import Path; from bricktrack_host.datasets import campaign_dataset as d;"
-        "d.unit_rows = lambda *_: os.kill(os.getpid(), 9);"
-        "from bricktrack_host.datasets.test_sources import sources_of_test;"
-        "d.add_units(Path(sys.argv[1]), sources_of_test(Path(sys.argv[2]), name='b'), whole_tests=True)"
-    )
-    died = subprocess.run([sys.executable, "-c", code, str(root), str(lab / "shake-12")], check=False)
-    assert died.returncode == -9
-    assert (root / ".adding").exists()
-    assert rows_of(root).num_rows == rows_of(campaign).num_rows
-    add_units(root, sources_of_test(lab / "shake-12", name="b"), whole_tests=True)
-    assert rows_of(root).num_rows == 2 * rows_of(campaign).num_rows
-
-
 def test_a_damaged_run_adds_nothing(lab, tmp_path):
     root = tmp_path / "campaign"
     sources = sources_of_test(lab / "shake-12")
@@ -310,17 +182,6 @@ def test_runs_by_themselves_are_added_under_a_name_and_never_over_others(lab, tm
     write_results(replace(result, manifest=other), tmp_path / "b7-1" / "results")
     with pytest.raises(ConfigError, match="the dataset has run b7-1_0001_shake there, not b7-1_0002_shake"):
         add_units(root, [source_of_run(tmp_path / "b7-1", name="12")], whole_tests=False)
-
-
-def test_a_folder_of_something_else_and_a_busy_dataset_are_refused(lab, tmp_path):
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(StorageError, match="left alone"):
-        add_units(tmp_path, sources_of_test(lab / "shake-12"), whole_tests=True)
-    with pytest.raises(RunFormatError, match="no dataset"):
-        open_dataset(tmp_path)
-    root = tmp_path / "campaign"
-    with campaign_folder.locked(root), pytest.raises(StorageError, match="another command adds"):
-        add_units(root, sources_of_test(lab / "shake-12"), whole_tests=True)
 
 
 # Versions of the schema.
