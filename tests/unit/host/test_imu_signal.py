@@ -159,3 +159,24 @@ def test_useless_tracks_are_refused_with_words(broken):
         t[20] = t[19]
         with pytest.raises(ShapeError, match="do not increase"):
             ImuSignal.from_track(track(t, gyro, acc))
+
+
+def test_gains_taken_out_give_the_signals_of_samples_without_them():
+    # A gap of 0.1 s is in it; the splines are turned, where the reference is made anew from other samples.
+    t = np.delete(np.arange(0, 2, 0.01), np.arange(80, 90))
+    rng = np.random.default_rng(4)
+    gyro, acc = wave(t)
+    gyro_gain, acc_gain = (np.eye(3) + 0.01 * rng.normal(size=(3, 3)) for _ in range(2))
+    read = track(t, gyro @ gyro_gain.T, acc @ acc_gain.T)
+    found = ImuSignal.from_track(read, gyro_filter_s=0.003).with_acc_filter(0.001)
+    found = found.without_gains(np.eye(3) + 0.1, np.eye(3))  # which is replaced
+    found = found.without_gains(gyro_gain, acc_gain).with_acc_filter(0.002)
+    direct = ImuSignal.from_track(track(t, gyro, acc), gyro_filter_s=0.003, acc_filter_s=0.002)
+    at = np.linspace(0.0, 1.99, 700)
+    for ours, wanted in (
+        (found.gyro_at(at), direct.gyro_at(at)),
+        (found.acc_at(at), direct.acc_at(at)),
+        (found.angle_at(at), direct.angle_at(at)),
+        (found.pieces().acc_twice, direct.pieces().acc_twice),
+    ):
+        np.testing.assert_allclose(ours, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())

@@ -78,7 +78,7 @@ def test_the_derivative_of_the_smoothed_motion_is_that_of_the_filter(plain):
     problem = replace(now.problem, leds=arrays)
     passed = Filter(problem)
     before = passed.smooth()
-    way = StandingWay(problem, passed, leds, last.pictured, 7, of=before.of)
+    way = StandingWay(problem, passed, leds, last.pictured, 7, of=before.of, n_views=done.errors.n_views)
     sure = np.zeros_like(done.errors.covariance)
     sure[FIRST_LED + 6, FIRST_LED + 6] = 1.0  # u of the fourth LED, px
     more = way.with_doubt(before, replace(done.errors, covariance=sure)).covariance[:, 0]
@@ -121,6 +121,15 @@ def test_pictures_predicted_once_serve_while_the_motion_moves_them_little(plain,
     off_m = np.abs(origin_m(held.states) - origin_m(anew.states))
     sd_m = np.sqrt(anew.states.estimate.variance[:, 0, POS])
     assert (off_m / sd_m).max() < 0.05
+
+
+def test_further_passes_would_move_the_motion_by_little_of_its_sd(plain, monkeypatch):
+    # The last pass moved it by less than a fifth of its sd; what is left to go is less.
+    monkeypatch.setattr(led_smoothing, "_STANDS_SDS", 0.0)
+    further = smoothed(plain_run())
+    sd_m = np.sqrt(further.states.estimate.variance[:, 0, POS])
+    off_sds = (origin_m(plain[0].states) - origin_m(further.states)) / sd_m
+    assert np.sqrt(np.mean(off_sds**2)) < 0.1
 
 
 def test_an_led_that_is_off_all_the_time_is_found():

@@ -4,7 +4,7 @@
 the samples can follow.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import comb
 
 import numpy as np
@@ -181,19 +181,6 @@ class CleanSamples:
     filled_sd_mps2: FloatArray
     fill: Fill | None = None
     t_sd_s: FloatArray | None = None
-
-    def without_gains(self, gyro_gain: FloatArray, acc_gain: FloatArray) -> "CleanSamples":
-        """Return the samples without the gains, shape (3, 3), that they have over the truth."""
-        fill = self.fill
-        if fill is not None:
-            gyro, acc = _without(gyro_gain, fill.gyro_radps), _without(acc_gain, fill.acc_mps2)
-            fill = replace(fill, gyro_radps=gyro, acc_mps2=acc)
-        gyro, acc = _without(gyro_gain, self.gyro_radps), _without(acc_gain, self.acc_mps2)
-        return replace(self, gyro_radps=gyro, acc_mps2=acc, fill=fill)
-
-
-def _without(gain: FloatArray, values: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.solve(gain, values.T).T, dtype=np.float64)
 
 
 def clean_samples(imu: ImuTrack, *, mend: bool = True) -> CleanSamples:

@@ -93,16 +93,23 @@ class SampledVector:
     period_s : float
     fill : (ndarray, ndarray) or None
         Instants and values, shape (m,) and (m, 3), that stand for samples missing in long gaps.
+    parts : tuple of (ndarray, SampledVector)
+        Vectors, each with a matrix, shape (3, 3), of which it is the sum: so are then its splines. None: it
+        was sampled itself.
+    turned_from : SampledVector or None
+        That of which it is the only part; next to equal, it is as rough.
     """
 
     t_s: FloatArray
     values: FloatArray
     period_s: float
     fill: tuple[FloatArray, FloatArray] | None
+    parts: tuple[tuple[FloatArray, "SampledVector"], ...] = ()
+    turned_from: "SampledVector | None" = None
 
     @cached_property
     def _roughness(self) -> tuple[FloatArray, FloatArray]:
-        return roughness(self.values)
+        return roughness(self.values) if self.turned_from is None else self.turned_from._roughness
 
     @property
     def steady(self) -> FloatArray:
@@ -112,6 +119,8 @@ class SampledVector:
     @cached_property
     def impacts(self) -> FloatArray:
         """Return the pulses, shape (n,), see `roughness`; across a gap the spline stands for neighbours."""
+        if self.turned_from is not None:
+            return self.turned_from.impacts
         t_s = self.t_s
         missing = np.flatnonzero(np.diff(t_s) > _GAP_PERIODS * self.period_s)
         if not missing.size:
@@ -124,26 +133,50 @@ class SampledVector:
     @cached_property
     def bridge_error(self) -> FloatArray:
         """Return the error of the cubic where one sample is missing, shape (n,)."""
-        return bridge_error(self.values)
+        return bridge_error(self.values) if self.turned_from is None else self.turned_from.bridge_error
 
     @cached_property
-    def spline(self) -> CubicSpline[Any]:
+    def spline(self) -> PPoly[Any]:
         """Return the signal."""
+        if self.parts:
+            return self._sum([part.spline for _, part in self.parts])
         return _spline(self.t_s, self.values, self.period_s, self.fill)
 
     @cached_property
     def once(self) -> PPoly[Any]:
         """Return its integral."""
+        if self.parts:
+            return self._sum([part.once for _, part in self.parts])
         return self.spline.antiderivative()
 
     @cached_property
     def twice(self) -> PPoly[Any]:
         """Return its double integral."""
+        if self.parts:
+            return self._sum([part.twice for _, part in self.parts])
         return self.spline.antiderivative(2)
 
+    def _sum(self, of_parts: list[PPoly[Any]]) -> PPoly[Any]:
+        turns = [turn.T for turn, _ in self.parts]
+        c = np.sum([piece.c @ turn for turn, piece in zip(turns, of_parts, strict=True)], axis=0)
+        return PPoly(c, of_parts[0].x)
+
     @cached_property
-    def _second_and_third(self) -> tuple[FloatArray, FloatArray]:
-        return _second_and_third(self.t_s, self.values)
+    def _second_and_third(self) -> tuple["SampledVector", "SampledVector"]:
+        """Return the derivatives by five points; what fills a gap stays as it is."""
+        fill = None if self.fill is None else (self.fill[0], np.zeros_like(self.fill[1]))
+        second, third = _second_and_third(self.t_s, self.values)
+        return (
+            SampledVector(self.t_s, second, self.period_s, fill),
+            SampledVector(self.t_s, third, self.period_s, fill),
+        )
+
+    def turned(self, turn: FloatArray) -> "SampledVector":
+        """Return the vector times a matrix near to one, shape (3, 3), in place of any other."""
+        if self.turned_from is not None:
+            return self.turned_from.turned(turn)
+        fill = None if self.fill is None else (self.fill[0], self.fill[1] @ turn.T)
+        return replace(self, values=self.values @ turn.T, fill=fill, parts=((turn, self),), turned_from=self)
 
     def sharpened(self, filter_s: float) -> "SampledVector":
         """Return the vector with the amplitudes that a low-pass took from it, at the times where it put them.
@@ -155,8 +188,14 @@ class SampledVector:
         """
         if filter_s <= 0:
             return self
+        if self.turned_from is not None:
+            return self.turned_from.sharpened(filter_s).turned(self.parts[0][0])
         second, third = self._second_and_third
-        return replace(self, values=self.values - filter_s**2 * second + 2 / 3 * filter_s**3 * third)
+        of_second, of_third = -(filter_s**2), 2 / 3 * filter_s**3
+        values = self.values + of_second * second.values + of_third * third.values
+        eye = np.eye(3)
+        parts = (eye, self), (of_second * eye, second), (of_third * eye, third)
+        return replace(self, values=values, parts=parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -225,6 +264,18 @@ class ImuSignal:
     def with_acc_filter(self, acc_filter_s: float) -> "ImuSignal":
         """Return the signals with this low-pass of the accelerometer undone, in place of any other."""
         return replace(self, _acc=self._acc_as_read.sharpened(acc_filter_s))
+
+    def without_gains(self, gyro_gain: FloatArray, acc_gain: FloatArray) -> "ImuSignal":
+        """Return the signals with these gains of the samples taken out, shape (3, 3), in place of any others.
+
+        No low-pass of the accelerometer is undone.
+        """
+        turn_gyro, turn_acc = (np.asarray(np.linalg.inv(g), dtype=np.float64) for g in (gyro_gain, acc_gain))
+        acc = self._acc_as_read.turned(turn_acc)
+        return replace(
+            self, _gyro_as_read=self._gyro_as_read.turned(turn_gyro), _gyro=self._gyro.turned(turn_gyro),
+            _acc_as_read=acc, _acc=acc,
+        )  # fmt: skip
 
     @property
     def gyro_radps(self) -> FloatArray:

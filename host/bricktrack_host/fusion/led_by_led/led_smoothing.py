@@ -22,21 +22,29 @@ from bricktrack_host.fusion.led_by_led.led_noise import (
     choose_inertial_noise,
     still_sightings,
 )
-from bricktrack_host.fusion.led_by_led.standing_errors import StandingErrors, StandingPrior, StandingWay
+from bricktrack_host.fusion.led_by_led.standing_errors import (
+    StandingErrors,
+    StandingPrior,
+    StandingWay,
+    views_told,
+)
 from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion, sample_poses
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run, build_problem, place_nodes
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, relinearised
-from bricktrack_host.fusion.smoothing.smoother import Filter
+from bricktrack_host.fusion.smoothing.linearisation import Linearisation
+from bricktrack_host.fusion.smoothing.smoother import POS, Filter, Problem
 
-_PASSES = 5
-_NOISE_CHOSEN_AFTER = 1  # pass: by then the pictures are predicted from what LEDs say
+_MOST_PASSES = 5
+_NOISE_CHOSEN_IN = 1  # the second pass: there the pictures are predicted from what LEDs say
+_STANDS_SDS = 0.2
+"""A pass that moves the motion by less is the last. What is then left to go is about a third of that (0.09 sd
+at most in ten simulated runs), and makes the errors greater by a two-hundredth."""
 _PICTURES_HOLD_PX = 0.2
 """Within which a picture moves in proportion to the motion, of focal lengths about 1500 px: the square leaves
 0.0001 px, and of the few that move by a pixel, at impacts, 0.003 px."""
 _HELD_SHARE = 0.99
 _GATE_CHI2 = 20.7  # of 2 degrees of freedom; passed by all but one in 30 000
-_SCALES_STAND = 0.1  # of the logarithm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +94,18 @@ class _Sights:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Ready:
+    """All that a pass needs; ``pictured`` is without the errors that stand still."""
+
+    pictured: Pictured
+    use: BoolArray
+    run: Run
+    nodes: Nodes
+    lin: Linearisation
+    problem: Problem
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Pass:
     """One pass over sights by what was believed; ``pictured`` is without the errors that stand still."""
 
@@ -114,39 +134,45 @@ def smooth_leds(
 
     Pictures are predicted for the pose-level motion ``first``, then for what came of it, and so on. Outliers
     are judged with hindsight each time and may come back; the noise, and errors that stand still, are taken
-    anew from each pass until they stand.
+    anew from each pass, until what a pass changes is little beside what is not known anyway.
     """
     n_leds = brick_model.n_leds
-    errors = StandingErrors.before(first.run, lever_arm_m, n_leds)
-    belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
     placeable = _placeable(leds, first, settings)
     if not len(placeable.t_ns):
         raise TrackingError("the motion pose by pose is too unsure to say where any LED should be seen")
     sights, _ = _sights(placeable, first, ray_model, brick_model)
+    n_views = views_told(sights.pictured)
+    errors = StandingErrors.before(first.run, lever_arm_m, n_leds, n_views=n_views)
+    belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
     now, use = first, np.ones(len(sights.leds.t_ns), dtype=np.bool_)
-    for i in range(_PASSES):
-        done = _pass(sights, use, now, first, belief)
+    for i in range(_MOST_PASSES):
+        ready = _prepared(sights, use, now, first, belief)
+        if i == _NOISE_CHOSEN_IN:
+            noise = choose_inertial_noise(
+                ready.problem, ready.run, ready.nodes, ready.lin, belief.levels, belief.settings
+            )
+            belief = replace(
+                belief, levels=noise.levels(belief.levels), settings=noise.settings(belief.settings)
+            )
+            ready = _prepared(sights, use, now, first, belief)
+        done, before = _pass(ready, first, belief), now
         leds, now = sights.leds, done.states
         still = now.nodes.camera_attitudes(now.run)
-        prior = StandingPrior.of(leds, done.pictured, n_leds, settings, camera_moves=still is not None)
-        way = StandingWay(
-            now.problem, now.passed, leds, done.pictured, n_leds, of=now.estimate.of, R_still_camera=still
+        prior = StandingPrior.of(
+            leds, done.pictured, n_leds, settings, n_views=n_views, camera_moves=still is not None
         )
+        way = StandingWay(
+            now.problem, now.passed, leds, done.pictured, n_leds,
+            of=now.estimate.of, n_views=n_views, R_still_camera=still,
+        )  # fmt: skip
         errors = way.estimate(prior, belief.errors.value)
+        if i == _MOST_PASSES - 1 or (i > _NOISE_CHOSEN_IN and _moved_sds(before, now) < _STANDS_SDS):
+            break
         scales = centroid_scales(done.chi2, sights.still, done.use, belief.scales)
         more = (scales / belief.scales)[sights.still.astype(np.int64)]
         use = (done.chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
-        stands = np.abs(np.log(scales / belief.scales)).max() < _SCALES_STAND
-        stands = stands and errors.stand_since(belief.errors)
-        is_settled = i > _NOISE_CHOSEN_AFTER and stands and np.array_equal(use, done.use)
-        if is_settled or i == _PASSES - 1:
-            break
-        levels, believed = belief.levels, belief.settings
-        if i == _NOISE_CHOSEN_AFTER:
-            noise = choose_inertial_noise(now.problem, now.run, now.nodes, now.lin, levels, believed)
-            levels, believed = noise.levels(levels), noise.settings(believed)
         run = belief.run.with_sensor(errors.of_sensor(since=belief.errors))
-        belief = _Belief(run, scales, levels, believed, errors)
+        belief = replace(belief, run=run, scales=scales, errors=errors)
         if not done.holds():
             sights, placed = _sights(leds, now, ray_model, brick_model)
             use = use[placed]
@@ -154,8 +180,21 @@ def smooth_leds(
     return SmoothedLeds(leds, states, done.chi2, done.use, belief.scales, errors)
 
 
-def _pass(sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, belief: _Belief) -> _Pass:
-    """Smooth once, linearised at the motion ``now``."""
+def _moved_sds(before: Smoothed, now: Smoothed) -> float:
+    """Return by how much a pass has moved the brick on the mean, in sd of each axis."""
+    n = min(len(before.nodes.t_s), len(now.nodes.t_s))
+    moved_m = _origin_m(now)[:n] - _origin_m(before)[:n]
+    return float(np.sqrt(np.nanmean(moved_m**2 / now.estimate.variance[:n, 0, POS])))
+
+
+def _origin_m(s: Smoothed) -> FloatArray:
+    """Return where the brick's origin was at the nodes, shape (K, 3)."""
+    state = s.estimate.state
+    return np.asarray(state.x[:, s.b, POS] - state.R[:, s.b] @ s.run.lever_arm_m)
+
+
+def _prepared(sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, belief: _Belief) -> _Ready:
+    """Return the problem of sights by what is believed, linearised at the motion ``now``."""
     settings, leds, pictured = belief.settings, sights.leds, sights.pictured
     off_px = belief.errors.in_picture_px(leds, pictured)
     pictured = replace(pictured, residual_px=pictured.residual_px - off_px)
@@ -171,14 +210,18 @@ def _pass(sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, belie
         leds, pictured, run, nodes, lin, belief.levels,
         scale=belief.scales[sights.still.astype(np.int64)], use=use, settings=settings,
     )  # fmt: skip
-    problem = replace(problem, leds=arrays)
-    passed = Filter(problem)
+    return _Ready(pictured, use, run, nodes, lin, replace(problem, leds=arrays))
+
+
+def _pass(ready: _Ready, first: Smoothed, belief: _Belief) -> _Pass:
+    """Smooth once."""
+    passed = Filter(ready.problem)
     estimate = passed.smooth()
     states = replace(
-        first, run=run, nodes=nodes, lin=lin, problem=problem, passed=passed, estimate=estimate, b=0,
-        levels=belief.levels,
+        first, run=ready.run, nodes=ready.nodes, lin=ready.lin, problem=ready.problem, passed=passed,
+        estimate=estimate, b=0, levels=belief.levels,
     )  # fmt: skip
-    return _Pass(pictured, use, states, led_chi2(problem, estimate))
+    return _Pass(ready.pictured, ready.use, states, led_chi2(ready.problem, estimate))
 
 
 def _placeable(leds: SeenLeds, s: Smoothed, settings: FusionSettings) -> SeenLeds:

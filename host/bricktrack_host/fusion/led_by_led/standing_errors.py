@@ -42,8 +42,10 @@ from bricktrack_host.tracking.pose.refine import OWN_SHARE
 _ARM = slice(18, N_ERRORS)
 _PROFILE, _SCALE = N_ERRORS, N_ERRORS + 1
 _FIRST_LED = N_ERRORS + 2
-_N_VIEWS = 6  # see `_by_view`
-_OF_LED = 2 * _N_VIEWS
+N_VIEWS = 6  # see `_by_view`
+_N_LINEAR = 3
+_CURVED_TELLS = 0.2
+"""Of an LED's own error, at the farthest view: where its square changes less of it, it is left out."""
 _SCALE_SD = 5e-5
 """Of the picture's size: light falls off towards its corners, also across the width of one LED, and draws the
 centroid inwards by some 0.02 px at 400 px from the centre; a lens that warms up does as much."""
@@ -61,11 +63,11 @@ _STAND_SD = 0.5  # of an error: what is not yet taken out of the motion is not i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandingErrors:
-    """Errors that stand still, in one vector of q = 23 + 12 L, or 46 + 12 L where the camera moves.
+    """Errors that stand still, in one vector of q = 23 + 2 V L, or 46 + 2 V L where the camera moves.
 
     In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
     the profile's, in units of its stated sd; the picture's size over what it should be, less 1; (u, v) of
-    each of L LEDs, px, and five times as many that change with the view, see `_by_view`; those of the sensor
+    each of L LEDs, px, and V - 1 times as many that change with the view, see `_by_view`; those of the sensor
     that moves with the camera, as in `CameraErrors.values`.
 
     Attributes
@@ -75,28 +77,32 @@ class StandingErrors:
     covariance : ndarray, shape (q, q)
     offset_sd_px : float
         Of the errors of single LEDs, as they show among themselves.
+    n_leds, n_views : int
     """
 
     value: FloatArray
     covariance: FloatArray
     offset_sd_px: float
     n_leds: int
+    n_views: int = N_VIEWS
 
     @classmethod
-    def before(cls, run: Run, lever_arm_m: FloatArray, n_leds: int) -> "StandingErrors":
+    def before(
+        cls, run: Run, lever_arm_m: FloatArray, n_leds: int, *, n_views: int = N_VIEWS
+    ) -> "StandingErrors":
         """Return what was taken out of a run's sensor already, given where it was said to be."""
         gains = [(gain - np.eye(3)).ravel() for gain in (run.gyro_gain, run.acc_gain)]
         theirs = np.zeros(0) if run.camera is None else run.camera.errors.values()
         value = np.concatenate(
-            [*gains, run.lever_arm_m - lever_arm_m, np.zeros(2 + _OF_LED * n_leds), theirs]
+            [*gains, run.lever_arm_m - lever_arm_m, np.zeros(2 + 2 * n_views * n_leds), theirs]
         )
-        return cls(value, np.zeros((len(value), len(value))), 0.0, n_leds)
+        return cls(value, np.zeros((len(value), len(value))), 0.0, n_leds, n_views)
 
     def of_sensor(self, *, since: "StandingErrors") -> SensorErrors:
         """Return what the inertial sensor's errors have changed by."""
         change = self.value - since.value
         gyro, acc = change[:18].reshape(2, 3, 3)
-        theirs = _FIRST_LED + _OF_LED * self.n_leds
+        theirs = _FIRST_LED + 2 * self.n_views * self.n_leds
         at = np.append(np.arange(N_ERRORS), np.arange(theirs, len(change)))
         camera = CameraErrors.of(change[theirs:]) if theirs < len(change) else None
         return SensorErrors(gyro, acc, change[_ARM], self.covariance[np.ix_(at, at)], camera)
@@ -108,10 +114,10 @@ class StandingErrors:
 
     def in_picture_px(self, leds: SeenLeds, pictured: Pictured) -> FloatArray:
         """Return by how much the centroids are off for them, shape (m, 2)."""
-        of_leds = self.value[_FIRST_LED : _FIRST_LED + _OF_LED * self.n_leds].reshape(
-            _N_VIEWS, self.n_leds, 2
+        of_leds = self.value[_FIRST_LED : _FIRST_LED + 2 * self.n_views * self.n_leds].reshape(
+            self.n_views, self.n_leds, 2
         )
-        own = np.einsum("mk,kmi->mi", _by_view(pictured), of_leds[:, leds.led])
+        own = np.einsum("mk,kmi->mi", _by_view(pictured, self.n_views), of_leds[:, leds.led])
         common = (
             self.value[_PROFILE] * pictured.profile_shift_px + self.value[_SCALE] * pictured.from_centre_px
         )
@@ -129,15 +135,24 @@ class StandingPrior:
     led_shift_px : ndarray, shape (L, 2)
         One standard deviation of each LED's profile, of which a share is its own.
     camera_sd : ndarray, shape (23,), or (0,) where the camera stands still
+    n_views : int
     """
 
     sensor_sd: FloatArray
     led_shift_px: FloatArray
     camera_sd: FloatArray
+    n_views: int
 
     @classmethod
     def of(
-        cls, leds: SeenLeds, pictured: Pictured, n_leds: int, settings: FusionSettings, *, camera_moves: bool
+        cls,
+        leds: SeenLeds,
+        pictured: Pictured,
+        n_leds: int,
+        settings: FusionSettings,
+        *,
+        n_views: int,
+        camera_moves: bool,
     ) -> "StandingPrior":
         """Return the belief for a run: the profile's share as it is on the mean over the run."""
         count = np.maximum(np.bincount(leds.led, minlength=n_leds), 1)
@@ -145,25 +160,25 @@ class StandingPrior:
             np.bincount(leds.led, part, minlength=n_leds) / count for part in pictured.profile_shift_px.T
         ]
         camera_sd = camera_prior_sd(settings) if camera_moves else np.zeros(0)
-        return cls(sensor_prior_sd(settings), np.stack(shift, axis=1), camera_sd)
+        return cls(sensor_prior_sd(settings), np.stack(shift, axis=1), camera_sd, n_views)
 
     def covariance(self, offset_sd_px: ArrayLike) -> FloatArray:
         """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...)."""
         own = OWN_SHARE * self.led_shift_px
         last_led = _FIRST_LED + own.size
-        by_view = slice(last_led, _FIRST_LED + _N_VIEWS * own.size)
+        by_view = slice(last_led, _FIRST_LED + self.n_views * own.size)
         q = by_view.stop + len(self.camera_sd)
         out = np.zeros((*np.shape(offset_sd_px), q, q))
         at = np.arange(q)
         out[..., at, at] = np.concatenate(
-            [self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(_N_VIEWS * own.size), self.camera_sd**2]
+            [self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(self.n_views * own.size), self.camera_sd**2]
         )
         for led, shift in enumerate(own):
             part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
             out[..., part, part] = np.outer(shift, shift)
         of_leds = at[_FIRST_LED:last_led]
         out[..., of_leds, of_leds] += np.square(offset_sd_px)[..., None]
-        of_profile = np.tile(np.repeat(0.5 * np.square(own).sum(axis=1), 2), _N_VIEWS - 1)
+        of_profile = np.tile(np.repeat(0.5 * np.square(own).sum(axis=1), 2), self.n_views - 1)
         out[..., at[by_view], at[by_view]] = np.square(offset_sd_px)[..., None] + of_profile
         return out
 
@@ -177,7 +192,7 @@ class StandingWay:
         Of LEDs; a run alone.
     leds, pictured : SeenLeds, Pictured
         Those of the problem.
-    n_leds : int
+    n_leds, n_views : int
     of : ndarray of int64, shape (c,)
         The states whose covariance is wanted.
     R_still_camera : ndarray, shape (K, 3, 3), optional
@@ -193,11 +208,12 @@ class StandingWay:
         n_leds: int,
         *,
         of: IntArray,
+        n_views: int = N_VIEWS,
         R_still_camera: FloatArray | None = None,
     ) -> None:
         m, n_nodes = len(leds.t_ns), len(problem.has_frame)
         self._camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, 0)
-        own = _own_part(problem, leds, pictured, n_leds, self._camera)
+        own = _own_part(problem, leds, pictured, (n_leds, n_views), self._camera)
         further = np.zeros((n_nodes - 1, 3, 0)) if self._camera is None else self._camera.velocity
         if problem.leds is None:
             raise ValueError("the problem has no LEDs")
@@ -231,7 +247,7 @@ class StandingWay:
         believed = prior.covariance(_HIDDEN_SHARE * offset_sd_px)
         _, value = _likeliest(believed, known, normal, pull)
         covariance = np.linalg.solve(np.eye(len(known)) + believed @ normal, believed)
-        return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px, n_leds)
+        return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px, n_leds, prior.n_views)
 
     def with_doubt(self, estimate: Estimate, errors: StandingErrors) -> Estimate:
         """Return smoothed states with what the errors leave unsure in their covariance."""
@@ -252,28 +268,41 @@ class StandingWay:
         return replace(estimate, covariance=covariance, variance=variance, doubt=doubt[:, None])
 
 
-def _by_view(pictured: Pictured) -> FloatArray:
-    """Return what of an LED's errors of one px each sight has, shape (m, _N_VIEWS).
+def views_told(pictured: Pictured) -> int:
+    """Return how many of `_by_view` tell: where LEDs are seen from nearly one side, their squares do not."""
+    curved = np.square(pictured.from_side_rad / _ALIKE_RAD).sum(axis=1) / np.sqrt(2)
+    return N_VIEWS if curved.max(initial=0.0) > _CURVED_TELLS else _N_LINEAR
+
+
+def _by_view(pictured: Pictured, n_views: int) -> FloatArray:
+    """Return what of an LED's errors of one px each sight has, shape (m, n_views), at most 6.
 
     The first stays as it is; the others are the first terms of errors alike within `_ALIKE_RAD`, whose
     likeness falls off as a Gaussian does.
     """
     x, y = pictured.from_side_rad.T / _ALIKE_RAD
-    return np.stack([np.ones_like(x), x, y, x * x / np.sqrt(2), x * y, y * y / np.sqrt(2)], axis=1)
+    terms = [np.ones_like(x), x, y]
+    if n_views > _N_LINEAR:
+        terms += [x * x / np.sqrt(2), x * y, y * y / np.sqrt(2)]
+    return np.stack(terms, axis=1)
 
 
 def _own_part(
-    problem: Problem, leds: SeenLeds, pictured: Pictured, n_leds: int, camera: CameraWay | None
+    problem: Problem,
+    leds: SeenLeds,
+    pictured: Pictured,
+    leds_and_views: tuple[int, int],
+    camera: CameraWay | None,
 ) -> FloatArray:
     """Return what each error changes of each LED's residual by itself, shape (m, 2, q)."""
     arrays = problem.leds
     if arrays is None:
         raise ValueError("the problem has no LEDs")
-    m = len(leds.t_ns)
-    own = np.zeros((m, 2, _FIRST_LED + _OF_LED * n_leds))
+    m, (n_leds, n_views) = len(leds.t_ns), leds_and_views
+    own = np.zeros((m, 2, _FIRST_LED + 2 * n_views * n_leds))
     own[:, :, _ARM] = arrays.J[..., 3:] @ arrays.R_lin
     own[:, :, _PROFILE], own[:, :, _SCALE] = -pictured.profile_shift_px, -pictured.from_centre_px
-    for k, view in enumerate(_by_view(pictured).T):
+    for k, view in enumerate(_by_view(pictured, n_views).T):
         at = _FIRST_LED + 2 * (n_leds * k + leds.led)
         own[np.arange(m), 0, at] = -view
         own[np.arange(m), 1, at + 1] = -view

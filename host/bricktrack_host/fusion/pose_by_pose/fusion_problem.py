@@ -7,7 +7,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.inertial.imu_samples import CleanSamples, clean_samples, seconds_since
+from bricktrack_host.fusion.inertial.imu_samples import clean_samples, seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.pose_by_pose.folded_vibration import samples_beside_camera
 from bricktrack_host.fusion.pose_by_pose.gap_fill import fill_of_gaps
@@ -67,7 +67,6 @@ class Run:
     """
 
     imu: ImuTrack
-    samples: CleanSamples
     signal: ImuSignal
     alignment: TimeAlignment
     lever_arm_m: FloatArray
@@ -128,7 +127,6 @@ class Run:
         )
         return cls(
             imu=imu,
-            samples=samples,
             signal=signal,
             alignment=alignment,
             lever_arm_m=lever_arm_mm * 1e-3,
@@ -162,9 +160,7 @@ class Run:
                 R_seen, p_seen_m = camera.poses_from(self.camera, self.still_s, R_seen, p_seen_m)
         return replace(
             self,
-            signal=ImuSignal.from_samples(
-                self.samples.without_gains(gyro_gain, acc_gain), gyro_filter_s=self.alignment.gyro_filter_s
-            ),
+            signal=self.signal.without_gains(gyro_gain, acc_gain),
             camera=camera,
             R_seen=R_seen,
             p_seen_m=p_seen_m,
