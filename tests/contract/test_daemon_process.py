@@ -157,7 +157,7 @@ def test_a_signal_during_a_recording_saves_it_as_interrupted(
     assert isinstance(armed, Armed)
     daemon.wait_for("recording")
     n_frames = daemon.status().frames
-    while daemon.status().frames < n_frames + 6:
+    while daemon.status().frames < n_frames + 12:
         time.sleep(0.05)
     assert daemon.end(number) == 0
     run = read_run(tmp_path / "storage" / "runs" / armed.run_id, verify_hashes=True)
