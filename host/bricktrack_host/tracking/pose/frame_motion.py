@@ -14,6 +14,7 @@ from bricktrack_host.tracking.led_model.led_profile import collar_of, predict_br
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.first_poses import FirstPoses
 from bricktrack_host.tracking.pose.refine import LedMotion, RefinedPoses
+from bricktrack_host.tracking.pose.turn_kernel import turns_between
 from bricktrack_host.tracks import FusedTrack, LedObservations
 
 _MAX_GAP_PERIODS = 3.5  # wider gaps end a spline: a shaken brick turns back within them
@@ -106,8 +107,7 @@ def motion_to_leds(
             samples = np.hstack([turns, t_camera_brick_mm[part]])
             spline = CubicSpline(seconds[part], samples)
             here, there = spline(seconds[part]), spline(led_seconds[part])
-            back = np.swapaxes(matrix_from_rvec(here[:, :3]), -1, -2)[:, None]
-            rvec[part] = rvec_from_matrix(back @ matrix_from_rvec(there[..., :3]))
+            rvec[part] = turns_between(here[:, :3], there[..., :3])
             shift[part] = there[..., 3:] - here[:, None, 3:]
             twist_sd[part], jump_sd[part] = _spline_doubt(samples, seconds[part])
     return LedMotion(
