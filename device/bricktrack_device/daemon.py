@@ -17,7 +17,7 @@ from bricktrack_device.network.connection_guard import raise_descriptor_limit
 from bricktrack_device.network.file_server import FileServer
 from bricktrack_device.network.unit_keys import UnitKeys
 from bricktrack_device.remote_settings import RemoteSettings
-from bricktrack_device.storage.recovery import rebuild_manifest
+from bricktrack_device.storage.recovery import recover_runs
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.systemd_notify import notify
 from bricktrack_device.unit_service import UnitService
@@ -70,8 +70,10 @@ class Daemon:
             folder = self._config.keys_folder
             keys = None if folder is None else UnitKeys(folder)
             server = FileServer(self._config.server.address, self._config.server.port, service, keys=keys)
-            for run_id in store.recover(rebuild_manifest):
-                logger.warning("%s: recovered after a cut while it was being saved", run_id)
+            for run_id in recover_runs(store):
+                logger.warning(
+                    "%s: recovered after a cut while it was being saved, or a damaged manifest", run_id
+                )
             if threading.current_thread() is threading.main_thread():
                 for number in STOP_SIGNALS:
                     signal.signal(number, self.stop)

@@ -101,9 +101,7 @@ class RemoteSettings:
         config = self._with({**values, **merged})
         text = dump_json(_Configured(values=merged))
         try:
-            temporary = self._path.with_suffix(".tmp")
-            self._disk.write_file(temporary, lambda file: file.write(text))
-            self._disk.rename(temporary, self._path)
+            self._disk.replace_file(self._path, text)
         except OSError as e:
             raise storage_error(f"{self._path}: the configuration cannot be written", e) from e
         for key in values:

@@ -25,6 +25,12 @@ class Disk:
             file.flush()
             os.fsync(file.fileno())
 
+    def replace_file(self, path: Path, data: bytes) -> None:
+        """Give a small file new contents, durably: after a power cut it holds the old ones or the new."""
+        temporary = path.with_suffix(".tmp")
+        self.write_file(temporary, lambda file: file.write(data))
+        self.rename(temporary, path)
+
     def sync_file(self, path: Path) -> None:
         """Make the contents of a file that others wrote durable."""
         with path.open("rb") as file:

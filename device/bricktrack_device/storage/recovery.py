@@ -1,6 +1,7 @@
-"""The manifest of a run whose saving was cut off: what was drafted, and what the files themselves say."""
+"""What a power cut left: whole runs are finished, cut ones get a manifest of what is there; nothing goes."""
 
 import logging
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -13,21 +14,101 @@ from bricktrack_common.imu_records import ImuDescription, read_imu
 from bricktrack_common.run_folder import read_edges
 from bricktrack_common.run_manifest import (
     EDGES_NAME,
+    FILE_NAME_PATTERN,
     FRAMES_NAME,
+    MANIFEST_NAME,
     VIDEO_NAME,
     ClocksSection,
     QualitySection,
     RunManifest,
     TriggerSection,
+    file_entry,
+    is_run_id,
     read_manifest,
 )
-from bricktrack_device.storage.run_writer import DRAFT_NAME
+from bricktrack_common.typed_data import dump_json
+from bricktrack_device.storage.run_store import RunStore
+from bricktrack_device.storage.run_writer import DRAFT_NAME, PARTIAL_SUFFIX
 
 logger = logging.getLogger(__name__)
 
 DAMAGED_SUFFIX = ".damaged"
 
 T = TypeVar("T")
+
+
+def recover_runs(store: RunStore) -> list[str]:
+    """Turn what a power cut left into runs: finish whole ones, mark the others interrupted.
+
+    A run whose manifest was lost later, by a failing card, is taken up again in the same way.
+
+    Returns
+    -------
+    recovered : list of str
+        Run ids. What cannot be recovered stays where it is, with a word in the log: the unit must come up.
+    """
+    store.empty_deleted()
+    for folder in store.folders():
+        try:
+            _reopen_if_damaged(folder, store)
+        except OSError as e:
+            logger.warning("%s: cannot be recovered now: %s", folder, e.strerror or e)
+    recovered = []
+    for partial in sorted(store.runs.glob(f"*{PARTIAL_SUFFIX}")):
+        run_id = partial.name.removesuffix(PARTIAL_SUFFIX)
+        if not partial.is_dir() or not is_run_id(run_id):
+            logger.warning("%s: not a run folder's name; left alone", partial)
+            continue
+        if (store.runs / run_id).exists():
+            logger.warning("%s: a run of this name exists already; left alone", partial)
+            continue
+        try:
+            _finish(partial, run_id, store)
+        except OSError as e:
+            logger.warning("%s: cannot be recovered now: %s", partial, e.strerror or e)
+        except Exception:
+            logger.exception("%s: a bug in its recovery; left alone", partial)
+        else:
+            recovered.append(run_id)
+    return recovered
+
+
+def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
+    """Take up a run again whose manifest is no JSON any more; one of a newer version is left alone."""
+    path = folder / MANIFEST_NAME
+    if not path.is_file():
+        return
+    try:
+        msgspec.json.decode(path.read_bytes())
+    except (msgspec.DecodeError, UnicodeDecodeError) as e:
+        logger.warning("%s: not valid JSON: %s; kept as %s%s", path, e, MANIFEST_NAME, DAMAGED_SUFFIX)
+        store.disk.rename(path, path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX))
+        store.disk.rename(folder, folder.with_name(folder.name + PARTIAL_SUFFIX))
+
+
+def _finish(partial: Path, run_id: str, store: RunStore) -> None:
+    if not _is_whole(partial):
+        manifest = rebuild_manifest(partial, run_id, store.unit)
+        entries = [file_entry(p) for p in sorted(partial.iterdir()) if _is_run_file(p)]
+        manifest = msgspec.structs.replace(manifest, files=entries)
+        store.disk.write_file(partial / MANIFEST_NAME, lambda f: f.write(dump_json(manifest)))
+        store.disk.sync_folder(partial)
+    (partial / DRAFT_NAME).unlink(missing_ok=True)
+    store.disk.rename(partial, store.runs / run_id)
+
+
+def _is_run_file(path: Path) -> bool:
+    is_own = path.name in (MANIFEST_NAME, DRAFT_NAME)
+    return path.is_file() and not is_own and re.fullmatch(FILE_NAME_PATTERN, path.name) is not None
+
+
+def _is_whole(folder: Path) -> bool:
+    """Tell whether only the renaming was cut off: the manifest and every hash are right."""
+    try:
+        manifest = read_manifest(folder / MANIFEST_NAME)
+        return all(file_entry(folder / f.name) == f for f in manifest.files)
+    except (RunFormatError, OSError):
+        return False
 
 
 def rebuild_manifest(folder: Path, run_id: str, unit: str) -> RunManifest:

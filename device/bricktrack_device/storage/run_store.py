@@ -19,7 +19,6 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TextIO
@@ -29,34 +28,26 @@ import msgspec
 from bricktrack_common.checksums import sha256_bytes
 from bricktrack_common.errors import RunFormatError, StorageError
 from bricktrack_common.run_manifest import (
-    FILE_NAME_PATTERN,
     MANIFEST_NAME,
-    RunManifest,
-    file_entry,
     is_run_id,
     parse_manifest,
-    read_manifest,
 )
 from bricktrack_common.typed_data import dump_json, load_json
-from bricktrack_common.wire_messages import ErrorCode, FileSummary, RunDescription, RunSummary
+from bricktrack_common.wire_messages import FileSummary, RunDescription, RunSummary
 from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.storage.confirmations import Confirmations
 from bricktrack_device.storage.disk import Disk, storage_error
-from bricktrack_device.storage.run_writer import DRAFT_NAME, PARTIAL_SUFFIX, RunWriter
+from bricktrack_device.storage.open_files import OpenFiles
+from bricktrack_device.storage.run_writer import PARTIAL_SUFFIX, RunWriter
 
 logger = logging.getLogger(__name__)
 
 _COUNTER_IN_ID = re.compile(r"_[0-9a-f]{6}_(\d{4,})(?:_|$)")
 _MAX_LISTED = 10_000
-_MAX_OPEN = 8
 
 
 class _Counter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     next_run: int
-
-
-class _Confirmation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    run_id: str
-    sha256: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +65,7 @@ class RunStore:
         Made if missing.
     unit : str
     disk : Disk
+        What writes to the card.
     boot_id : str or None
         The kernel's, which tells the boots of one unit apart; read if not given.
 
@@ -88,19 +80,18 @@ class RunStore:
     ) -> None:
         self.folder = folder
         self.unit = unit
-        self._disk = disk or Disk()
+        self.disk = disk or Disk()
         self._boot = (boot_id or _kernel_boot_id()).replace("-", "")[:6]
         self._lock = threading.Lock()
-        self._files_lock = threading.Lock()
         self._lock_file: TextIO | None = None
         self._runs_known: dict[str, _KnownRun] = {}
-        self._open_files: dict[tuple[str, str], int] = {}
         self._problems_told: set[str] = set()
         self.runs = folder / "runs"
-        self._confirmed = folder / "confirmed"
+        self._files = OpenFiles(self.runs)
+        self._confirmations = Confirmations(folder / "confirmed", self.disk)
         self._deleted = folder / "deleted"
         try:
-            for path in (self.runs, self._confirmed):
+            for path in (self.runs, self._confirmations.folder):
                 path.mkdir(parents=True, exist_ok=True)
             if not os.access(self.runs, os.W_OK):
                 raise PermissionError(errno.EACCES, "not writable")
@@ -122,16 +113,19 @@ class RunStore:
         try:
             self._lock_file = path.open("w")
             fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as e:
+        except BlockingIOError as e:
             self.unlock()
             raise StorageError(
                 f"storage folder {self.folder} is in use by another bricktrackd. Stop that one, or set "
                 "storage.folder (or --storage) to another folder"
             ) from e
+        except OSError as e:
+            self.unlock()
+            raise storage_error(f"{path}: cannot be locked", e) from e
 
     def unlock(self) -> None:
         """Let others have the folder; also closes what reading left open."""
-        self.close_files()
+        self._files.close()
         if self._lock_file is not None:
             self._lock_file.close()
             self._lock_file = None
@@ -147,78 +141,39 @@ class RunStore:
             If the counter cannot be written.
         """
         path = self.folder / "next_run.json"
-        number = 1 + max((_counter_of(p.name) for p in self._folders()), default=0)
+        number = 1 + max((_counter_of(p.name) for p in self._entries()), default=0)
         try:
             number = max(number, load_json(path, _Counter).next_run)
         except RunFormatError as e:
             if path.exists():
                 logger.warning("%s; counting on from the runs that are there", e)
         try:
-            temporary = path.with_suffix(".tmp")
-            self._disk.write_file(temporary, lambda f: f.write(dump_json(_Counter(next_run=number + 1))))
-            self._disk.rename(temporary, path)
+            self.disk.replace_file(path, dump_json(_Counter(next_run=number + 1)))
         except OSError as e:
             raise storage_error(f"{path}: the run counter cannot be written", e) from e
         return f"{self.unit}_{self._boot}_{number:04d}" + (f"_{label}" if label else "")
 
     def free_bytes(self) -> int:
-        """Return the free space."""
-        return self._disk.free_bytes(self.folder)
+        """Return the free space; raise `StorageError` where the card does not tell."""
+        try:
+            return self.disk.free_bytes(self.folder)
+        except OSError as e:
+            raise storage_error(f"{self.folder}: its free space cannot be told", e) from e
 
     def open_writer(self, run_id: str) -> RunWriter:
         """Return what writes one run."""
-        return RunWriter(self.runs, run_id, self._disk)
+        return RunWriter(self.runs, run_id, self.disk)
 
-    # After a power cut
-
-    def recover(self, rebuild: Callable[[Path, str, str], RunManifest]) -> list[str]:
-        """Turn what a power cut left into runs: finish whole ones, mark the others interrupted.
-
-        Parameters
-        ----------
-        rebuild : callable
-            Makes a manifest (without files) over what a partial folder holds: folder, run id, unit.
-
-        Returns
-        -------
-        recovered : list of str
-            Run ids. What cannot be recovered stays where it is, with a warning.
-        """
+    def empty_deleted(self) -> None:
+        """Do away with what a power cut left of runs that were being deleted."""
         shutil.rmtree(self._deleted, ignore_errors=True)
-        recovered = []
-        for partial in sorted(self.runs.glob(f"*{PARTIAL_SUFFIX}")):
-            run_id = partial.name.removesuffix(PARTIAL_SUFFIX)
-            if not partial.is_dir() or not is_run_id(run_id):
-                logger.warning("%s: not a run folder's name; left alone", partial)
-                continue
-            final = self.runs / run_id
-            if final.exists():
-                logger.warning("%s: a run of this name exists already; left alone", partial)
-                continue
-            try:
-                if not _is_whole(partial):
-                    self._finish_interrupted(partial, rebuild(partial, run_id, self.unit))
-                (partial / DRAFT_NAME).unlink(missing_ok=True)
-                self._disk.rename(partial, final)
-            except OSError as e:
-                logger.warning("%s: cannot be recovered now: %s", partial, e.strerror or e)
-                continue
-            recovered.append(run_id)
-        return recovered
-
-    def _finish_interrupted(self, partial: Path, manifest: RunManifest) -> None:
-        entries = [file_entry(p) for p in sorted(partial.iterdir()) if _is_run_file(p)]
-        manifest = msgspec.structs.replace(manifest, state="interrupted", files=entries)
-        path = partial / MANIFEST_NAME
-        self._disk.write_file(path, lambda f: f.write(dump_json(manifest)))
-        self._disk.sync_folder(partial)
 
     # Reading
 
     def list_runs(self) -> list[RunSummary]:
         """Return all whole runs, oldest first; at most the newest ten thousand."""
         summaries = []
-        for folder in sorted(self._folders(), key=lambda p: (_counter_of(p.name), p.name))[-_MAX_LISTED:]:
+        for folder in sorted(self.folders(), key=lambda p: (_counter_of(p.name), p.name))[-_MAX_LISTED:]:
             try:
                 run = self._known(folder.name)
             except RequestRefusedError as e:
@@ -231,14 +186,14 @@ class RunStore:
                     run_id=folder.name,
                     state=run.state,
                     n_bytes=sum(f.n_bytes for f in run.description.files),
-                    confirmed=self.is_confirmed(folder.name),
+                    confirmed=self._confirmations.has(folder.name),
                 )
             )
         return summaries
 
     def count_runs(self) -> int:
         """Return how many run folders there are."""
-        return sum(1 for _ in self._folders())
+        return sum(1 for _ in self.folders())
 
     def describe(self, run_id: str) -> RunDescription:
         """Return a run's files; index 0 is its manifest.
@@ -269,31 +224,13 @@ class RunStore:
                 "out-of-range", f"{run_id}: {entry.name} has {entry.n_bytes} bytes; offset {offset} is behind"
             )
         try:
-            # Not mapped into memory: a card that fails then is an error here, not the end of the process.
-            with self._files_lock:
-                file = self._descriptor(run_id, entry.name)
-                return os.pread(file, min(length, entry.n_bytes - offset), offset)
+            return self._files.read(
+                run_id, entry.name, offset=offset, length=min(length, entry.n_bytes - offset)
+            )
         except OSError as e:
             raise RequestRefusedError(
                 "internal", f"{run_id}: {entry.name} cannot be read: {e.strerror or e}"
             ) from e
-
-    def _descriptor(self, run_id: str, name: str) -> int:
-        """Return an open file's descriptor; the last few that were asked for stay open."""
-        key = run_id, name
-        found = self._open_files.pop(key, None)
-        if found is None:
-            found = os.open(self.runs / run_id / name, os.O_RDONLY)
-        self._open_files[key] = found
-        if len(self._open_files) > _MAX_OPEN:
-            os.close(self._open_files.pop(next(iter(self._open_files))))
-        return found
-
-    def close_files(self, run_id: str | None = None) -> None:
-        """Close the files that reading left open, of one run or all."""
-        with self._files_lock:
-            for key in [k for k in self._open_files if run_id in (None, k[0])]:
-                os.close(self._open_files.pop(key))
 
     def confirm(self, run_id: str, sha256: list[str]) -> None:
         """Note that the host holds a run: the hashes, in any order, must be those of all its files.
@@ -311,27 +248,12 @@ class RunStore:
                 f"{run_id}: {len(sha256)} hashes do not match the {len(files)} files"
                 + (f"; differing: {', '.join(wrong)}" if wrong else ""),
             )
-        path = self._confirmed / f"{run_id}.json"
-        note = dump_json(_Confirmation(run_id=run_id, sha256=sha256))
-        try:
-            temporary = path.with_suffix(".tmp")
-            self._disk.write_file(temporary, lambda f: f.write(note))
-            self._disk.rename(temporary, path)
-        except OSError as e:
-            code: ErrorCode = "no-space" if e.errno == errno.ENOSPC else "internal"
-            raise RequestRefusedError(code, f"{path}: {e.strerror or e}") from e
-
-    def is_confirmed(self, run_id: str) -> bool:
-        """Tell whether a host has said that it holds a run."""
-        return (self._confirmed / f"{run_id}.json").exists()
+        self._confirmations.note(run_id, sha256)
 
     def count_unconfirmed(self) -> int:
         """Return how many run folders no host has confirmed."""
-        try:
-            notes = {p.stem for p in self._confirmed.glob("*.json")}
-        except OSError as e:
-            raise storage_error(f"{self._confirmed}: cannot be listed", e) from e
-        return sum(1 for folder in self._folders() if folder.name not in notes)
+        confirmed = self._confirmations.run_ids()
+        return sum(1 for folder in self.folders() if folder.name not in confirmed)
 
     def delete(self, run_id: str, *, force: bool = False) -> int:
         """Remove a run that a host has confirmed, or any with ``force``; return how many bytes it had.
@@ -346,30 +268,34 @@ class RunStore:
         folder = self.runs / run_id
         if not is_run_id(run_id) or run_id.endswith(PARTIAL_SUFFIX) or not folder.is_dir():
             raise RequestRefusedError("no-such-run", f"there is no run {run_id!r:.120} on this unit")
-        if not force and not self.is_confirmed(run_id):
+        if not force and not self._confirmations.has(run_id):
             raise RequestRefusedError(
                 "not-confirmed",
                 f"no host has confirmed that it holds run {run_id}: pull it first, or force its deletion",
             )
         try:
-            self.close_files(run_id)
+            self._files.close(run_id)
             n_bytes = sum(p.stat().st_size for p in folder.iterdir())
             self._deleted.mkdir(exist_ok=True)
             shutil.rmtree(self._deleted / run_id, ignore_errors=True)
             with self._lock:
                 self._runs_known.pop(run_id, None)
-                self._disk.rename(folder, self._deleted / run_id)
-            self._disk.sync_folder(self.runs)
-            (self._confirmed / f"{run_id}.json").unlink(missing_ok=True)
+                self.disk.rename(folder, self._deleted / run_id)
+            self.disk.sync_folder(self.runs)
+            self._confirmations.forget(run_id)
             shutil.rmtree(self._deleted / run_id)
         except OSError as e:
             raise RequestRefusedError("internal", f"run {run_id} cannot be deleted: {e.strerror or e}") from e
         logger.info("%s: deleted (%s)", run_id, "forced" if force else "confirmed")
         return n_bytes
 
-    def _folders(self) -> list[Path]:
+    def folders(self) -> list[Path]:
+        """Return the folders named as whole runs; raise `StorageError` where they cannot be listed."""
+        return [p for p in self._entries() if is_run_id(p.name) and p.suffix != PARTIAL_SUFFIX]
+
+    def _entries(self) -> list[Path]:
         try:
-            return [p for p in self.runs.iterdir() if is_run_id(p.name) and p.suffix != PARTIAL_SUFFIX]
+            return list(self.runs.iterdir())
         except OSError as e:
             raise storage_error(f"{self.runs}: cannot be listed", e) from e
 
@@ -399,20 +325,6 @@ class RunStore:
 def _counter_of(name: str) -> int:
     found = _COUNTER_IN_ID.search(name)
     return int(found.group(1)) if found else 0
-
-
-def _is_run_file(path: Path) -> bool:
-    is_own = path.name in (MANIFEST_NAME, DRAFT_NAME)
-    return path.is_file() and not is_own and re.fullmatch(FILE_NAME_PATTERN, path.name) is not None
-
-
-def _is_whole(folder: Path) -> bool:
-    """Tell whether only the renaming was cut off: the manifest and every hash are right."""
-    try:
-        manifest = read_manifest(folder / MANIFEST_NAME)
-        return all(file_entry(folder / f.name) == f for f in manifest.files)
-    except (RunFormatError, OSError):
-        return False
 
 
 def _kernel_boot_id() -> str:

@@ -20,8 +20,9 @@ from bricktrack_device.capture.ring import VideoCut
 from bricktrack_device.capture.trigger import EdgeTrain
 from bricktrack_device.interfaces import EncodedPacket
 from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.storage import recovery
 from bricktrack_device.storage.disk import Disk
-from bricktrack_device.storage.recovery import rebuild_manifest
+from bricktrack_device.storage.recovery import recover_runs
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME
 
@@ -167,7 +168,7 @@ def test_power_cut_at_any_step_leaves_a_run_that_says_what_it_lacks(tmp_path: Pa
             save(recording(run_id), store.open_writer(run_id), write_truth)
 
         again = store_in(folder)  # the next boot
-        again.recover(rebuild_manifest)
+        recover_runs(again)
         assert not list((folder / "runs").glob("*.partial"))
         runs = again.list_runs()
         if cut_at == 1:  # the folder itself was never made
@@ -182,7 +183,7 @@ def test_power_cut_at_any_step_leaves_a_run_that_says_what_it_lacks(tmp_path: Pa
             assert whole_video or any("video.h264" in words for words in run.problems)
         else:
             assert run.problems == []
-        assert again.recover(rebuild_manifest) == []
+        assert recover_runs(again) == []
     # Only the last steps, after the manifest was written, give a whole run.
     assert states == sorted(states, reverse=True) and states[0] == "interrupted" and states[-1] == "complete"
 
@@ -194,7 +195,7 @@ def test_recovery_without_the_draft_takes_what_the_streams_say(tmp_path: Path) -
     partial = final.rename(final.with_name(run_id + ".partial"))
     (partial / "manifest.json").unlink()
     (partial / "Weird Name").write_text("left alone")
-    assert store_in(tmp_path).recover(rebuild_manifest) == [run_id]
+    assert recover_runs(store_in(tmp_path)) == [run_id]
     run = read_run(final, verify_hashes=True)
     assert run.manifest.state == "interrupted" and run.manifest.trigger.t0_ns == T0
     assert list(run.imus) == ["brick"] and run.manifest.camera is None
@@ -208,9 +209,56 @@ def test_recovery_never_overwrites_a_run_and_leaves_strange_folders(tmp_path: Pa
     before = (tmp_path / "runs" / run_id / "manifest.json").read_bytes()
     (tmp_path / "runs" / f"{run_id}.partial").mkdir()
     (tmp_path / "runs" / "-odd-.partial").mkdir()
-    assert store_in(tmp_path).recover(rebuild_manifest) == []
+    assert recover_runs(store_in(tmp_path)) == []
     assert (tmp_path / "runs" / f"{run_id}.partial").is_dir()
     assert (tmp_path / "runs" / run_id / "manifest.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("damage", [lambda data: bytes(len(data)), lambda data: data[:100], lambda data: b""])
+def test_a_run_whose_manifest_is_damaged_is_taken_up_again(
+    tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    store = store_in(tmp_path)
+    run_id, other = save_one(store), save_one(store)
+    path = tmp_path / "runs" / run_id / "manifest.json"
+    path.write_bytes(damage(path.read_bytes()))
+    newer = tmp_path / "runs" / other / "manifest.json"
+    newer.write_text('{"schema": "bricktrack.run", "version": 99}')
+    assert recover_runs(store_in(tmp_path)) == [run_id]
+    run = read_run(path.parent, verify_hashes=True)
+    assert run.manifest.state == "interrupted" and run.manifest.trigger.t0_ns == T0
+    assert run.video is not None and run.video.stat().st_size == 100 * N_FRAMES
+    assert path.with_name("manifest.json.damaged").exists()
+    assert newer.read_text().endswith("99}")  # a newer bricktrack reads it
+
+
+def test_a_bug_in_a_recovery_leaves_the_folder_alone_and_the_unit_comes_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_in(tmp_path)
+    folders = [tmp_path / "runs" / save_one(store) for _ in range(2)]
+    for folder in folders:
+        (folder / "manifest.json").unlink()
+        folder.rename(folder.with_name(folder.name + ".partial"))
+
+    def break_down(folder: Path, run_id: str, unit: str) -> RunManifest:
+        if run_id == folders[0].name:
+            raise ZeroDivisionError("a bug")
+        return rebuild(folder, run_id, unit)
+
+    rebuild = recovery.rebuild_manifest
+    monkeypatch.setattr(recovery, "rebuild_manifest", break_down)
+    assert recover_runs(store_in(tmp_path)) == [folders[1].name]
+    assert folders[0].with_name(folders[0].name + ".partial").is_dir()
+
+
+def test_a_card_that_does_not_say_how_full_it_is_is_named(tmp_path: Path) -> None:
+    store = store_in(tmp_path / "card")
+    (tmp_path / "card").rename(tmp_path / "gone")
+    with pytest.raises(StorageError, match=r"card: its free space cannot be told: No such file"):
+        store.free_bytes()
+    with pytest.raises(StorageError, match=r"lock: cannot be locked: No such file"):
+        store.lock()
 
 
 def test_a_full_disk_at_any_step_keeps_what_was_saved_and_can_be_taken_up_again(tmp_path: Path) -> None:
@@ -359,7 +407,7 @@ def test_a_power_cut_while_deleting_leaves_a_whole_run_or_none(tmp_path: Path) -
             assert fail_at > disk.n  # every step was cut once
             break
         store = RunStore(folder, "unit-1", boot_id=BOOT)
-        assert store.recover(rebuild_manifest) == []
+        assert recover_runs(store) == []
         if (folder / "runs" / run_id).exists():
             assert read_run(folder / "runs" / run_id, verify_hashes=True).manifest.state == "complete"
         assert not (folder / "deleted").exists()
