@@ -1,7 +1,9 @@
 """What is beyond doubt in pictures for which assignments of lights to LEDs are proposed.
 
 The proposals are verified, and weighed with the likeliest ones without each of their LEDs. The likeliest is
-the answer, in those LEDs whose lights have the odds of all that agree against all that do not.
+the answer, in those LEDs whose lights have the odds of all that agree against all that do not. The less an
+LED is needed, the surer it must be: five that fit bear each other out, a sixth or seventh tells little more,
+and a false light beside a hidden LED comes as one of these.
 """
 
 from collections.abc import Sequence
@@ -19,8 +21,12 @@ from bricktrack_host.tracking.identity.weighing import weighed_at
 from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracking.pose.refine import LedMotion, RefinedPoses
 
-_SURE = 7.0  # log odds, 1000 to one, of each LED's light against all else that was weighed
-_ENOUGH = 4.0  # 50 to one, of LEDs without which there is no answer
+_WELL_BORNE_OUT = 5  # LEDs: two more numbers than a pose with one to spare needs
+_AMONG_FIVE = 4.0  # log odds, 50 to one, of each LED's light against all else that was weighed
+_BEYOND_FIVE = 10.0
+"""20,000 to one. Of lights within 3 px of a hidden LED of a simulated brick at rest, which come in 1 of 7000
+pictures with five false lights, 10 % are named by odds of 7 and 4 % by these."""
+_AMONG_FEWER = 7.0  # 1000 to one
 _CONTENDS = 12.0  # log odds below the best at which an assignment without each of its LEDs may still matter
 _BRICK = 7.0  # log odds of any brick at all: false lights alone reach it in one picture of 1000, at most
 
@@ -114,9 +120,7 @@ class Pictures:
         )
         n_leds = (answer >= 0).sum(axis=1)
         whole = answer
-        answer = np.where(log_odds > _SURE, whole, -1)
-        few = ~self._is_enough(answer)
-        answer[few] = np.where(log_odds > _ENOUGH, whole, -1)[few]
+        answer = self._beyond_doubt(whole, log_odds)
         has_rival = ~self._is_enough(answer)
         is_chance = evidence[row] < _BRICK
         again = np.flatnonzero((answer != whole).any(axis=1) & (row >= 0) & ~has_rival & ~is_chance)
@@ -125,6 +129,15 @@ class Pictures:
             poses = poses.replaced(row[again], fitted.poses)
             has_rival[again] = (fitted.kept != (answer[again] >= 0)).any(axis=1)
         return Verdict(row, answer, poses, n_leds, is_chance, has_rival)
+
+    def _beyond_doubt(self, assigned: IntArray, log_odds: FloatArray) -> IntArray:
+        """Return assignments without the LEDs whose odds, (n, n_leds), do not do."""
+        rank = (-log_odds).argsort(axis=1, kind="stable").argsort(axis=1)
+        needed = np.where(rank < _WELL_BORNE_OUT, _AMONG_FIVE, _BEYOND_FIVE)
+        out = np.where(log_odds > needed, assigned, -1)
+        few = ((out >= 0).sum(axis=1) < _WELL_BORNE_OUT) | ~self._is_enough(out)
+        out[few] = np.where(log_odds > _AMONG_FEWER, assigned, -1)[few]
+        return out
 
     def _is_enough(self, assigned: IntArray) -> BoolArray:
         """Tell which assignments have a pose, with an LED to spare."""
