@@ -42,7 +42,8 @@ from bricktrack_host.results.result_store import (
     read_result,
     software_version,
 )
-from bricktrack_host.results.result_tables import (
+from bricktrack_host.results.run_summary import key_figures, verdict
+from bricktrack_host.results.table_columns import (
     Column,
     Columns,
     covariance_column,
@@ -50,7 +51,6 @@ from bricktrack_host.results.result_tables import (
     make_table,
     vector_columns,
 )
-from bricktrack_host.results.run_summary import key_figures, verdict
 from bricktrack_host.transfer.assembly_config import AssemblyConfig
 
 CONVENTIONS = {

@@ -195,9 +195,8 @@ def motion_from_rest(track: FusedTrack | OpticalTrack, rest: RestPose) -> Motion
 
     The covariance holds that of the rest pose too.
     """
-    relative = rest.relative(track.R_camera_brick, track.t_camera_brick_mm)
-    covariance = rest.relative_covariance(track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
-    return Motion(relative.R, relative.t_mm, covariance, track.flags)
+    moved = rest.from_rest(track)
+    return Motion(moved.R, moved.t_mm, moved.covariance, track.flags)
 
 
 def _motion_of(view: View, sample: IntArray, index: IntArray, track: FusedTrack, rest: RestPose) -> Motion:

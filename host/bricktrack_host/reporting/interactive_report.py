@@ -40,6 +40,7 @@ from bricktrack_host.results.run_summary import (
     KeyFigures,
     imu_minus_camera_ns,
     key_figures,
+    main_kind,
     main_track,
     verdict,
 )
@@ -155,15 +156,16 @@ def _time_panels(result: RunResult, figures: KeyFigures) -> TimePanels:
 
 
 def _motion(result: RunResult, panels: TimePanels) -> tuple[PlotSection, GridPlot]:
-    axis, optical, track = TimeAxis.of(result), result.optical, main_track(result)
+    axis, optical, kind = TimeAxis.of(result), result.optical, main_kind(result)
     d = "d" if result.rest is not None else ""
     names = [f"{d}x", f"{d}y", f"{d}z", f"{d}rot x", f"{d}rot y", f"{d}rot z"]
-    if track is not None:
-        y, sd = six_components(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
+    if kind is not None:
+        track = result.fused[kind]
+        y, sd = six_components(result, kind)
         y[track.flags & int(NOT_MEASURED) != 0] = np.nan
         fused = samples(axis.s(track.t_ns), banded(y, 1.96 * sd), flags=track.flags)
     seen = np.asarray(np.isfinite(optical.t_camera_brick_mm).all(axis=1))
-    y, sd = six_components(result, optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance)
+    y, sd = six_components(result, "optical")
     columns = banded(y[seen], 1.96 * sd[seen])
     columns["frame"] = np.flatnonzero(seen).astype(np.float64)
     columns["leds"] = np.count_nonzero(np.isfinite(optical.residual_px[seen]).all(axis=2), axis=1).astype(
@@ -179,7 +181,7 @@ def _motion(result: RunResult, panels: TimePanels) -> tuple[PlotSection, GridPlo
         dots.name = "optical"
         tell(panel, dots, [("optical", value), ("frame", "@frame{0} at @t{0.0000} s, @leds{0} LEDs"),
                            ("flags", "@said")], along_time=False)  # fmt: skip
-        if track is not None:
+        if kind is not None:
             panel.varea("t", f"low{i}", f"high{i}", source=fused, fill_color=FUSED, fill_alpha=0.22)
             line = panel.line("t", f"y{i}", source=fused, line_color=FUSED, line_width=1.2)
             line.name = "fused"
@@ -348,11 +350,12 @@ def _timing(result: RunResult, figures: KeyFigures, panels: TimePanels) -> list[
 
 
 def _spectra(result: RunResult) -> list[tuple[PlotSection, GridPlot]]:
-    track = main_track(result)
-    if track is None:
+    kind = main_kind(result)
+    if kind is None:
         return []
+    track = result.fused[kind]
     inside = np.asarray(track.flags & int(NOT_MEASURED) == 0)
-    values, _ = six_components(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
+    values, _ = six_components(result, kind)
     known = inside & np.isfinite(values).all(axis=1)
     if np.count_nonzero(known) < MIN_SAMPLES:
         return []

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,10 @@ from bricktrack_host.reporting.chart import INK as INK
 from bricktrack_host.reporting.chart import Chart, Panel, panel_grid
 from bricktrack_host.reporting.chart_marks import Instants, Line, Scatter, Spans, band
 from bricktrack_host.reporting.thinning import thinned, thinned_band
+from bricktrack_host.results.rest_pose import FromRest
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.results.run_summary import KeyFigures, main_track
+from bricktrack_host.results.result_tables import FusedKind
+from bricktrack_host.results.run_summary import KeyFigures, main_kind
 from bricktrack_host.results.spectra import MIN_SAMPLES, amplitude_spectrum
 
 FUSED = "#1f5f8b"
@@ -144,29 +146,25 @@ def motion_chart(
     else:
         chart = panel_grid(3, 2, height_in=6.0, legend=True)
         panels = [row[k] for k in range(2) for row in chart.panels]
-    track = main_track(result)
-    optical = result.optical
-    optical_s = axis.s(optical.t_ns)
-    optical_y, optical_sd = six_components(
-        result, optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance
-    )
+    kind = main_kind(result)
+    optical_s = axis.s(result.optical.t_ns)
+    optical_y, optical_sd = six_components(result, "optical")
     chosen = np.ones(len(optical_s), dtype=bool)
     if span_s is not None:
         chosen = (optical_s >= span_s[0]) & (optical_s <= span_s[1])
-    if track is not None:
+    if kind is not None:
+        track = result.fused[kind]
         fused_s = axis.s(track.t_ns)
         inside = track.flags & int(PoseFlag.EXTRAPOLATED) == 0
         if span_s is not None:
             inside &= (fused_s >= span_s[0]) & (fused_s <= span_s[1])
-        fused_y, fused_sd = six_components(
-            result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance
-        )
+        fused_y, fused_sd = six_components(result, kind)
         fused_s, fused_y, fused_sd = fused_s[inside], fused_y[inside], fused_sd[inside]
     d = "d" if result.rest is not None else ""
     names = [f"{d}x, mm", f"{d}y, mm", f"{d}z, mm", f"{d}rot x, deg", f"{d}rot y, deg", f"{d}rot z, deg"]
     for i, panel in enumerate(panels):
         mark_events(panel, axis, result, figures)
-        if track is not None:
+        if kind is not None:
             y, half = fused_y[:, i], 1.96 * fused_sd[:, i]
             promised = thinned_band(fused_s, y - half, y + half)
             panel.add(
@@ -188,14 +186,15 @@ def motion_chart(
 
 def spectrum_chart(result: RunResult) -> Chart | None:
     """Return amplitude spectra of the motion at inertial slots; `None` where it is too short."""
-    track = main_track(result)
-    if track is None:
+    kind = main_kind(result)
+    if kind is None:
         return None
+    track = result.fused[kind]
     inside = track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) == 0
     inside &= np.isfinite(track.t_camera_brick_mm).all(axis=1)
     if np.count_nonzero(inside) < MIN_SAMPLES:
         return None
-    values, _ = six_components(result, track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
+    values, _ = six_components(result, kind)
     spectrum = amplitude_spectrum((track.t_ns[inside] - track.t_ns[inside][0]) / 1e9, values[inside])
     nyquist_hz = half_frame_rate_hz(result)
     chart = panel_grid(1, 2, height_in=2.9, titles=True, share_x="none")
@@ -219,17 +218,15 @@ def half_frame_rate_hz(result: RunResult) -> float | None:
     return 0.5e9 * (len(stamps_ns) - 1) / float(stamps_ns[-1] - stamps_ns[0]) if len(stamps_ns) > 1 else None
 
 
-def six_components(
-    result: RunResult, R: FloatArray, t_mm: FloatArray, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def six_components(result: RunResult, kind: Literal["optical"] | FusedKind) -> tuple[FloatArray, FloatArray]:
     """Return x, y, z, mm, and rotation vector, deg, from rest if there is one, with their deviations."""
-    if result.rest is not None:
-        covariance = result.rest.relative_covariance(R, t_mm, covariance)
-        moved = result.rest.relative(R, t_mm)
-        R, t_mm = moved.R, moved.t_mm
-    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    track = result.optical if kind == "optical" else result.fused[kind]
+    seen = result.from_rest.get(kind) or FromRest(
+        track.R_camera_brick, track.t_camera_brick_mm, track.covariance
+    )
+    sd = np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2))
     return (
-        np.concatenate([t_mm, np.rad2deg(rvec_from_matrix(R))], axis=1),
+        np.concatenate([seen.t_mm, np.rad2deg(rvec_from_matrix(seen.R))], axis=1),
         np.concatenate([sd[:, 3:], np.rad2deg(sd[:, :3])], axis=1),
     )
 

@@ -10,7 +10,7 @@ from bricktrack_common.errors import TrackingError
 from bricktrack_common.poses import Pose
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix, skew
 from bricktrack_host.results.ray_errors import RayErrors
-from bricktrack_host.tracks import ImuTrack, OpticalTrack
+from bricktrack_host.tracks import FusedTrack, ImuTrack, OpticalTrack
 
 MIN_FRAMES = 4  # three steps: a vibrating brick stands still for one step at its turning point, not for three
 _STILL_MM = 0.05  # steps below this are rest whatever the covariance promises
@@ -19,6 +19,23 @@ _STILL_GYRO_RADPS = np.deg2rad(1.0)
 _STILL_ACC_MPS2 = 0.5
 _N_SD = 5.0
 _N_IN_A_ROW = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FromRest:
+    """Poses of a track as seen from rest, in the brick's axes at rest.
+
+    Attributes
+    ----------
+    R : ndarray, shape (n, 3, 3)
+    t_mm : ndarray, shape (n, 3), mm
+    covariance : ndarray, shape (n, 6, 6)
+        Of ``[dtheta rad, dt mm]``, with the rest pose's own; see `RestPose.relative_covariance`.
+    """
+
+    R: FloatArray
+    t_mm: FloatArray
+    covariance: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +67,12 @@ class RestPose:
     spread_rad: FloatArray
     source: Literal["found", "given"]
     ray_errors: RayErrors | None = None
+
+    def from_rest(self, track: OpticalTrack | FusedTrack) -> FromRest:
+        """Return the poses of a track as seen from this one, with their covariance."""
+        R, t_mm = track.R_camera_brick, track.t_camera_brick_mm
+        moved = self.relative(R, t_mm)
+        return FromRest(moved.R, moved.t_mm, self.relative_covariance(R, t_mm, track.covariance))
 
     def relative(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> Pose:
         """Return the pose of the brick seen from its own rest pose, in the brick's axes at rest.

@@ -8,6 +8,7 @@ import hashlib
 import importlib.metadata
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +26,17 @@ from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_host.durable_files import kept_beside, write_folder_whole
 from bricktrack_host.results.daq_clock import EdgeFit, fit_edges
 from bricktrack_host.results.rest_entry import RestEntry, rest_entry, rest_pose_of
-from bricktrack_host.results.rest_pose import RestPose
+from bricktrack_host.results.rest_pose import FromRest, RestPose
 from bricktrack_host.results.result_tables import (
-    CONVENTIONS,
     FusedKind,
     edges_table,
-    fused_from_table,
     fused_table,
-    imu_from_table,
     imu_table,
     leds_table,
-    optical_from_tables,
     optical_table,
 )
+from bricktrack_host.results.table_columns import CONVENTIONS
+from bricktrack_host.results.tables_to_tracks import fused_from_table, imu_from_table, optical_from_tables
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
 RESULTS_SCHEMA = "bricktrack.results"
@@ -72,7 +71,7 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     settings: Details = {}
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RunResult:
     """Everything that processing one run gave.
 
@@ -122,6 +121,19 @@ class RunResult:
     def t0_ns(self) -> int | None:
         """Return the trigger, CLOCK_MONOTONIC of the unit; `None` if none came."""
         return self.manifest.trigger.t0_ns
+
+    @cached_property
+    def from_rest(self) -> dict[str, FromRest]:
+        """The poses as seen from rest: ``"optical"`` and each kind of `fused`; empty without a rest pose.
+
+        Worked out once, for tables, page and comparison with the truth.
+        """
+        if self.rest is None:
+            return {}
+        seen = {"optical": self.rest.from_rest(self.optical)}
+        for kind, track in self.fused.items():
+            seen[kind] = self.rest.from_rest(track)
+        return seen
 
 
 class _Summary(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -218,7 +230,7 @@ def _write_files(result: RunResult, folder: Path) -> None:
             result.optical,
             result.observations,
             t0_ns=t0_ns,
-            rest=result.rest,
+            from_rest=result.from_rest.get("optical"),
             edge_fit=result.edge_fit,
             metadata=metadata,
         ),
@@ -227,6 +239,7 @@ def _write_files(result: RunResult, folder: Path) -> None:
             edge_index=result.edge_index,
             t0_ns=t0_ns,
             rest=result.rest,
+            from_rest=result.from_rest,
             edge_fit=result.edge_fit,
             metadata=metadata,
         ),

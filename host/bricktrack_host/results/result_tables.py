@@ -1,78 +1,38 @@
-"""The tables of a processed run: each column with its unit and meaning, built from the tracks and read back.
+"""The tables of a processed run, built from its tracks; `tables_to_tracks` reads them back.
 
 `docs/results-format.md` describes every column; a test compares the two.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_common.errors import RunFormatError
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.rotations import (
     angles_xyz_from_matrix,
     continuous_quaternions,
-    matrix_from_quaternion,
     quaternion_from_matrix,
     rvec_from_matrix,
 )
-from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.quality import LedFlag
 from bricktrack_host.results.daq_clock import EdgeFit
-from bricktrack_host.results.rest_pose import RestPose
+from bricktrack_host.results.rest_pose import FromRest, RestPose
+from bricktrack_host.results.table_columns import (
+    Column,
+    Columns,
+    covariance_column,
+    flag_columns,
+    flag_words,
+    make_table,
+    vector_columns,
+)
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
 FusedKind = Literal["imu", "frame", "edge"]
 FUSED_KINDS: tuple[FusedKind, ...] = ("imu", "frame", "edge")
-_TRIANGLE = np.triu_indices(6)
-_XYZ = "xyz"
-
-CONVENTIONS = {
-    "time": "t_ns is CLOCK_MONOTONIC of the unit, int64 ns; t_s counts from the first rising edge, in s",
-    "camera frame": "origin at the projection centre, x right (u), y down (v), z out through the lens, mm",
-    "brick frame": "origin at the first LED of the layout, axes as in the drawing, mm",
-    "rest frame": "the brick frame where it stood before the shake; columns in d are seen from it",
-    "quaternion": "order w, x, y, z; takes brick to camera coordinates; the sign is chosen to be continuous",
-    "rotation vector": "axis times angle, rad, of the rotation that takes brick to camera coordinates",
-    "angles": "intrinsic XYZ, degrees: R = Rx(angle_x) @ Ry(angle_y) @ Rz(angle_z)",
-    "covariance": "upper triangle, row by row, of the 6 x 6 covariance of [dtheta rad, dt mm]: "
-    "R_true = R Exp(dtheta), brick axes; t_true = t + dt, camera axes",
-    "missing": "NaN, with a bit in flags that says why",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """One column: name, unit, and what it means, for the schema and for people."""
-
-    name: str
-    unit: str
-    meaning: str
-
-
-Columns = list[tuple[Column, "pa.Array[Any]"]]
-
-
-def pose_flag_words(flags: IntArray) -> list[str]:
-    """Return the names of the set `PoseFlag` bits of each value, as ``"dropout|impact"``."""
-    return _words(flags, PoseFlag)
-
-
-def led_flag_words(flags: IntArray) -> list[str]:
-    """Return the names of the set `LedFlag` bits of each value, as ``"border|merged"``."""
-    return _words(flags, LedFlag)
-
-
-def _words(flags: IntArray, kind: type[PoseFlag] | type[LedFlag] | type[ImuFlag]) -> list[str]:
-    names = [(int(f), (f.name or "").lower()) for f in kind if int(f)]
-    values, which = np.unique(flags, return_inverse=True)
-    known = ["|".join(name for bit, name in names if bit & value) for value in values.tolist()]
-    return [known[i] for i in which.tolist()]
-
-
-# Tracks to tables.
 
 
 def optical_table(
@@ -80,7 +40,7 @@ def optical_table(
     observations: LedObservations,
     *,
     t0_ns: int | None,
-    rest: RestPose | None,
+    from_rest: FromRest | None,
     edge_fit: EdgeFit | None,
     metadata: dict[str, str],
 ) -> "pa.Table":
@@ -92,7 +52,7 @@ def optical_table(
         (Column("frame", "1", "number of the frame record in the run"),
          pa.array(np.arange(len(optical.t_ns)))),
         *_time_columns(optical.t_ns, t0_ns, edge_fit),
-        *_pose_columns(optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance, rest),
+        *_pose_columns(optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance, from_rest),
         (Column("n_leds", "1", "LEDs that the pose is of"), pa.array(n_used)),
         (Column("residual_rms_px", "px", "root of the mean squared distance, seen less predicted"),
          pa.array(rms_px)),
@@ -112,6 +72,7 @@ def fused_table(
     edge_index: IntArray,
     t0_ns: int | None,
     rest: RestPose | None,
+    from_rest: Mapping[str, FromRest],
     edge_fit: EdgeFit | None,
     metadata: dict[str, str],
 ) -> "pa.Table":
@@ -121,8 +82,8 @@ def fused_table(
     if not tracks:
         tracks, kinds = [_empty_track()], ["imu"]
 
-    def joined(name: str) -> Any:
-        return np.concatenate([getattr(track, name) for track in tracks])
+    def joined(name: str, of: Sequence[FusedTrack | FromRest] = tracks) -> Any:
+        return np.concatenate([getattr(one, name) for one in of])
 
     kind_of = np.repeat(np.arange(len(kinds)), [len(track.t_ns) for track in tracks])
     t_ns = joined("t_ns")
@@ -133,6 +94,8 @@ def fused_table(
     is_edge = (number >= 0)[order]
     omega = joined("omega_brick_radps")[order]
     v_mmps = joined("v_camera_mmps")[order]
+    moved = [from_rest[kind] for kind in kinds if kind in from_rest]
+    seen = FromRest(*(joined(name, moved)[order] for name in ("R", "t_mm", "covariance"))) if moved else None
     columns: Columns = [
         (Column("kind", "", "what fixes the instant: imu (slot), frame (picture) or edge (square wave)"),
          pa.array([kinds[k] for k in kind_of[order]], type=pa.string())),
@@ -140,7 +103,7 @@ def fused_table(
          pa.array(number[order], mask=~is_edge)),
         *_time_columns(t_ns[order], t0_ns, edge_fit),
         *_pose_columns(joined("R_camera_brick")[order], joined("t_camera_brick_mm")[order],
-                       joined("covariance")[order], rest),
+                       joined("covariance")[order], seen),
         *vector_columns("omega_{}_radps", "rad/s", "angular rate in brick axes", omega),
         *vector_columns("v_{}_mmps", "mm/s", "velocity of the first LED, camera axes", v_mmps),
         *vector_columns("dv_{}_mmps", "mm/s", "velocity of the first LED, brick axes at rest",
@@ -184,7 +147,7 @@ def leds_table(
          pa.array(residual[:, 1])),
         (Column("flags", "bits", "LedFlag bits"), pa.array(flags)),
         (Column("flag_words", "", "names of the LedFlag bits, parted by |"),
-         pa.array(led_flag_words(flags), type=pa.string())),
+         pa.array(flag_words(flags, LedFlag), type=pa.string())),
     ]  # fmt: skip
     return make_table(columns, metadata)
 
@@ -197,7 +160,7 @@ def imu_table(imu: ImuTrack, *, t0_ns: int | None, metadata: dict[str, str]) -> 
         *vector_columns("gyro_{}_radps", "rad/s", "angular rate in brick axes, with bias", imu.gyro_radps),
         (Column("flags", "bits", "ImuFlag bits"), pa.array(imu.flags)),
         (Column("flag_words", "", "names of the ImuFlag bits, parted by |"),
-         pa.array(_words(imu.flags, ImuFlag), type=pa.string())),
+         pa.array(flag_words(imu.flags, ImuFlag), type=pa.string())),
     ]  # fmt: skip
     return make_table(columns, metadata)
 
@@ -225,17 +188,14 @@ def _time_columns(t_ns: IntArray, t0_ns: int | None, edge_fit: EdgeFit | None) -
     ]  # fmt: skip
 
 
-def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest: RestPose | None) -> Columns:
+def _pose_columns(
+    R: FloatArray, t_mm: FloatArray, covariance: FloatArray, from_rest: FromRest | None
+) -> Columns:
     q = continuous_quaternions(quaternion_from_matrix(R))
-    if rest is None:
-        R_rest, d_mm = np.full_like(R, np.nan), np.full_like(t_mm, np.nan)
-        d_cov = np.full_like(covariance, np.nan)
-    else:
-        relative = rest.relative(R, t_mm)
-        R_rest, d_mm = relative.R, relative.t_mm
-        d_cov = rest.relative_covariance(R, t_mm, covariance)
+    if from_rest is None:
+        from_rest = FromRest(*(np.full_like(values, np.nan) for values in (R, t_mm, covariance)))
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    d_sd = np.sqrt(np.diagonal(d_cov, axis1=1, axis2=2))
+    d_sd = np.sqrt(np.diagonal(from_rest.covariance, axis1=1, axis2=2))
     return [
         *vector_columns("{}_mm", "mm", "position of the first LED, camera frame", t_mm),
         *(
@@ -249,13 +209,15 @@ def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest:
             "intrinsic XYZ angle, brick to camera",
             np.rad2deg(angles_xyz_from_matrix(R)),
         ),
-        *vector_columns("d{}_mm", "mm", "displacement of the first LED from rest, brick axes at rest", d_mm),
-        *vector_columns("drvec_{}_rad", "rad", "rotation vector from rest", rvec_from_matrix(R_rest)),
+        *vector_columns(
+            "d{}_mm", "mm", "displacement of the first LED from rest, brick axes at rest", from_rest.t_mm
+        ),
+        *vector_columns("drvec_{}_rad", "rad", "rotation vector from rest", rvec_from_matrix(from_rest.R)),
         *vector_columns(
             "dangle_{}_deg",
             "deg",
             "intrinsic XYZ angle from rest",
-            np.rad2deg(angles_xyz_from_matrix(R_rest)),
+            np.rad2deg(angles_xyz_from_matrix(from_rest.R)),
         ),
         *vector_columns("sd_{}_mm", "mm", "standard deviation of the position, camera axes", sd[:, 3:]),
         *vector_columns(
@@ -274,149 +236,11 @@ def _pose_columns(R: FloatArray, t_mm: FloatArray, covariance: FloatArray, rest:
     ]
 
 
-def covariance_column(covariance: FloatArray) -> tuple[Column, "pa.Array[Any]"]:
-    """Return the upper triangles of covariances, shape (n, 6, 6), as one column of lists."""
-    triangle = np.ascontiguousarray(covariance[:, _TRIANGLE[0], _TRIANGLE[1]])
-    packed = pa.FixedSizeListArray.from_arrays(pa.array(triangle.reshape(-1)), 21)
-    return Column("covariance", "rad, mm", "see the table's conventions; left out of the CSV"), packed
-
-
-def vector_columns(name: str, unit: str, meaning: str, values: FloatArray) -> Columns:
-    """Return three columns, x, y and z; ``{}`` in the name stands for the letter."""
-    return [
-        (Column(name.format(c), unit, f"{meaning}: {c}"), pa.array(np.ascontiguousarray(values[:, i])))
-        for i, c in enumerate(_XYZ)
-    ]
-
-
-def flag_columns(flags: IntArray) -> Columns:
-    """Return `PoseFlag` bits and their names."""
-    return [
-        (Column("flags", "bits", "PoseFlag bits"), pa.array(flags)),
-        (
-            Column("flag_words", "", "names of the PoseFlag bits, parted by |"),
-            pa.array(pose_flag_words(flags), type=pa.string()),
-        ),
-    ]
-
-
 def _turned(v_camera: FloatArray, rest: RestPose | None) -> FloatArray:
     return np.full_like(v_camera, np.nan) if rest is None else np.asarray(v_camera @ rest.R_camera_rest)
-
-
-def make_table(columns: Columns, metadata: dict[str, str]) -> "pa.Table":
-    """Return a table whose schema carries unit and meaning of each column."""
-    fields = [
-        pa.field(c.name, array.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c, array in columns
-    ]
-    keys: dict[str | bytes, str | bytes] = dict(metadata.items())
-    return pa.Table.from_arrays([array for _, array in columns], schema=pa.schema(fields, metadata=keys))
 
 
 def _empty_track() -> FusedTrack:
     none = np.empty(0, dtype=np.int64)
     zero3 = np.empty((0, 3))
     return FusedTrack(none, np.empty((0, 3, 3)), zero3, zero3, zero3, np.empty((0, 6, 6)), none)
-
-
-# Tables back to tracks.
-
-
-def optical_from_tables(
-    optical: "pa.Table", leds: "pa.Table", n_leds: int
-) -> tuple[OpticalTrack, LedObservations]:
-    """Return what `optical_table` and `leds_table` were made of."""
-    n = optical.num_rows
-    if leds.num_rows != n * n_leds:
-        raise RunFormatError(f"leds table has {leds.num_rows} rows; expected {n} frames x {n_leds} LEDs")
-    uv = np.stack([_floats(leds, "u_px"), _floats(leds, "v_px")], axis=1)
-    residual = np.stack([_floats(leds, "residual_u_px"), _floats(leds, "residual_v_px")], axis=1)
-    cov = np.empty((n * n_leds, 2, 2))
-    cov[:, 0, 0], cov[:, 1, 1] = _floats(leds, "var_u_px2"), _floats(leds, "var_v_px2")
-    cov[:, 0, 1] = cov[:, 1, 0] = _floats(leds, "cov_uv_px2")
-    track = OpticalTrack(
-        t_ns=_ints(optical, "t_ns"),
-        R_camera_brick=_rotations(optical),
-        t_camera_brick_mm=_vectors(optical, "{}_mm"),
-        covariance=_covariances(optical),
-        flags=_ints(optical, "flags"),
-        residual_px=residual.reshape(n, n_leds, 2),
-        led_t_ns=_ints(leds, "t_ns").reshape(n, n_leds),
-    )
-    observations = LedObservations(
-        sensor_timestamp_ns=_ints(optical, "sensor_timestamp_ns"),
-        exposure_ns=_ints(optical, "exposure_ns"),
-        uv_px=uv.reshape(n, n_leds, 2),
-        cov_px2=cov.reshape(n, n_leds, 2, 2),
-        area_px2=_floats(leds, "area_px2").reshape(n, n_leds),
-        led_flags=_ints(leds, "flags").reshape(n, n_leds),
-        frame_flags=_ints(optical, "frame_flags"),
-    )
-    return track, observations
-
-
-def fused_from_table(table: "pa.Table") -> tuple[dict[FusedKind, FusedTrack], IntArray]:
-    """Return the fused tracks by kind, and the numbers of the edges."""
-    kind = np.array(table.column("kind").to_pylist(), dtype=object)
-    R, covariance = _rotations(table), _covariances(table)
-    fused: dict[FusedKind, FusedTrack] = {}
-    number = np.empty(0, dtype=np.int64)
-    for name in FUSED_KINDS:
-        rows = np.flatnonzero(kind == name)
-        if not rows.size:
-            continue
-        fused[name] = FusedTrack(
-            t_ns=_ints(table, "t_ns")[rows],
-            R_camera_brick=R[rows],
-            t_camera_brick_mm=_vectors(table, "{}_mm")[rows],
-            omega_brick_radps=_vectors(table, "omega_{}_radps")[rows],
-            v_camera_mmps=_vectors(table, "v_{}_mmps")[rows],
-            covariance=covariance[rows],
-            flags=_ints(table, "flags")[rows],
-        )
-        if name == "edge":
-            numbers = table.column("edge_index").to_pylist()
-            number = np.array([numbers[i] for i in rows], dtype=np.int64)
-    return fused, number
-
-
-def imu_from_table(table: "pa.Table", acc_range_mps2: float) -> ImuTrack:
-    """Return what `imu_table` was made of."""
-    return ImuTrack(
-        t_ns=_ints(table, "t_ns"),
-        acc_mps2=_vectors(table, "acc_{}_mps2"),
-        gyro_radps=_vectors(table, "gyro_{}_radps"),
-        flags=_ints(table, "flags"),
-        acc_range_mps2=acc_range_mps2,
-    )
-
-
-def _column(table: "pa.Table", name: str) -> Any:
-    if name not in table.column_names:
-        raise RunFormatError(f"results table without the column '{name}'; was it written by bricktrack?")
-    return table.column(name).to_numpy()
-
-
-def _floats(table: "pa.Table", name: str) -> FloatArray:
-    return np.array(_column(table, name), dtype=np.float64)
-
-
-def _ints(table: "pa.Table", name: str) -> IntArray:
-    return np.array(_column(table, name), dtype=np.int64)
-
-
-def _vectors(table: "pa.Table", name: str) -> FloatArray:
-    return np.stack([_floats(table, name.format(c)) for c in _XYZ], axis=1)
-
-
-def _rotations(table: "pa.Table") -> FloatArray:
-    return matrix_from_quaternion(np.stack([_floats(table, f"q_{c}") for c in "wxyz"], axis=1))
-
-
-def _covariances(table: "pa.Table") -> FloatArray:
-    column: Any = table.column("covariance").combine_chunks()
-    triangle = np.asarray(column.flatten().to_numpy(zero_copy_only=False)).reshape(-1, 21)
-    covariance = np.empty((len(triangle), 6, 6))
-    covariance[:, _TRIANGLE[0], _TRIANGLE[1]] = triangle
-    covariance[:, _TRIANGLE[1], _TRIANGLE[0]] = triangle
-    return covariance

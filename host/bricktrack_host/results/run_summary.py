@@ -9,6 +9,7 @@ from bricktrack_common.imu_records import UNUSABLE
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.result_store import RunResult
+from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.tracks import FusedTrack
 
 MUCH_DROPPED = 0.01  # of the frames; one now and then harms nothing
@@ -58,9 +59,16 @@ class KeyFigures:
     n_imu_unusable: int
 
 
+def main_kind(result: RunResult) -> FusedKind | None:
+    """Return which fused motion is on the densest even grid: of sensor slots, else of frames, else `None`."""
+    kinds: tuple[FusedKind, ...] = ("imu", "frame")
+    return next((kind for kind in kinds if kind in result.fused), None)
+
+
 def main_track(result: RunResult) -> FusedTrack | None:
-    """Return the fused motion on the densest even grid: sensor slots, else frames, else `None`."""
-    return result.fused.get("imu") or result.fused.get("frame")
+    """Return the fused motion of `main_kind`."""
+    kind = main_kind(result)
+    return None if kind is None else result.fused[kind]
 
 
 def imu_minus_camera_ns(result: RunResult) -> int:

@@ -14,7 +14,7 @@ from bricktrack_common.errors import TrackingError
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.results.rest_pose import RestPose
+from bricktrack_host.results.rest_pose import FromRest
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.true_motion import TrueMotion
 from bricktrack_host.tracks import FusedTrack, OpticalTrack
@@ -151,8 +151,9 @@ def compare_with_truth(result: RunResult, truth: TrueMotion) -> TruthComparison:
         masks = {k: _group_masks(tracks[k], k, dropouts_ns, impacts_ns) for k in tracks}
         names = dict.fromkeys(name for m in masks.values() for name in m)
         zeroed = {}
-        if result.rest is not None and true_rest is not None:
-            zeroed = {k: _rest_errors(t, *true[k], result.rest, true_rest) for k, t in tracks.items()}
+        if true_rest is not None:
+            seen = {k: result.from_rest["optical" if source == "optical" else k] for k in tracks}
+            zeroed = {k: _rest_errors(seen[k], *true[k], true_rest) for k in tracks}
         for name in names:
             chosen = [(k, masks[k][name]) for k in tracks if name in masks[k]]
             if not any(mask.any() for _, mask in chosen):
@@ -203,26 +204,19 @@ class _Errors:
 
 
 def _rest_errors(
-    track: OpticalTrack | FusedTrack,
-    R_true: FloatArray,
-    t_true_mm: FloatArray,
-    rest: RestPose,
-    true_rest: tuple[FloatArray, FloatArray],
+    moved: FromRest, R_true: FloatArray, t_true_mm: FloatArray, true_rest: tuple[FloatArray, FloatArray]
 ) -> _Errors:
     """Return the errors of displacements from rest, each seen from its own rest pose."""
-    moved_mm = (track.t_camera_brick_mm - rest.t_camera_rest_mm) @ rest.R_camera_rest
-    true_moved_mm = (t_true_mm - true_rest[1]) @ true_rest[0]
-    turned = rest.R_camera_rest.T @ track.R_camera_brick
+    off_mm = moved.t_mm - (t_true_mm - true_rest[1]) @ true_rest[0]
     true_turned = true_rest[0].T @ R_true
-    turn_rad = rvec_from_matrix(np.swapaxes(true_turned, -1, -2) @ turned)
-    covariance = rest.relative_covariance(track.R_camera_brick, track.t_camera_brick_mm, track.covariance)
-    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    turn_rad = rvec_from_matrix(np.swapaxes(true_turned, -1, -2) @ moved.R)
+    sd = np.sqrt(np.diagonal(moved.covariance, axis1=1, axis2=2))
     return _Errors(
-        error=np.concatenate([moved_mm - true_moved_mm, np.rad2deg(turn_rad)], axis=1),
+        error=np.concatenate([off_mm, np.rad2deg(turn_rad)], axis=1),
         sd=np.concatenate([sd[:, 3:], np.rad2deg(sd[:, :3])], axis=1),
-        nees=normalised_squares(np.concatenate([turn_rad, moved_mm - true_moved_mm], axis=1), covariance),
+        nees=normalised_squares(np.concatenate([turn_rad, off_mm], axis=1), moved.covariance),
         has_truth=_known(t_true_mm),
-        has_pose=_known(track.t_camera_brick_mm),
+        has_pose=_known(moved.t_mm),
     )
 
 
