@@ -234,7 +234,7 @@ def test_runs_are_pulled_and_each_unit_shows_how_far_it_is(page, lab):
     screenshot(page, "orders")
     assert float(bar.get_attribute("value")) < 1.0
     go_on.set()
-    expect(page.locator(".order-words")).to_contain_text("pull: 1 of 1 units acknowledged", timeout=30_000)
+    expect(page.locator(".order-words")).to_contain_text("pull: 1 of 1 units done", timeout=30_000)
     expect(page.locator(".lines tr", has_text="aimed")).to_contain_text("1 run here, verified")
     assert (lab[3] / "runs" / "aimed_0001" / "video.h264").stat().st_size == 600_000
 

@@ -88,7 +88,8 @@ class Order:
     @property
     def words(self) -> str:
         """One line: how far it is."""
-        parts = [f"{self.doing}: {len(self.acknowledged)} of {len(self.units)} units acknowledged"]
+        good = "done" if self.doing == "pull" else "acknowledged"
+        parts = [f"{self.doing}: {len(self.acknowledged)} of {len(self.units)} units {good}"]
         if self.refused:
             parts.append(f"{len(self.refused)} failed")
         n_bytes, n_bytes_total = self.n_bytes
