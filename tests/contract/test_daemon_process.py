@@ -15,16 +15,8 @@ import pytest
 import zmq
 
 from bricktrack_common.run_folder import read_run
-from bricktrack_common.wire_messages import (
-    Arm,
-    Armed,
-    GetStatus,
-    Reply,
-    Request,
-    StatusReply,
-    decode_reply,
-    encode_message,
-)
+from bricktrack_common.wire_codec import decode_reply, encode_message
+from bricktrack_common.wire_messages import Arm, Armed, GetStatus, Reply, Request, StatusReply
 
 PATIENCE_S = 120.0
 """For a computer that does much else; what works comes far sooner."""

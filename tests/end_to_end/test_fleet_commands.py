@@ -23,7 +23,8 @@ from typer.testing import CliRunner
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.key_files import make_key_pair, write_secret_key
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
-from bricktrack_common.wire_messages import Arm, DeleteRun, Refusal, encode_message
+from bricktrack_common.wire_codec import encode_message
+from bricktrack_common.wire_messages import Arm, DeleteRun, Refusal
 from bricktrack_host.cli import app
 
 LAYOUT_OF_SEVEN = Path(__file__).parents[1] / "data" / "path-traced" / "layout.toml"

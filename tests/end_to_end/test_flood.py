@@ -19,6 +19,7 @@ import zmq
 
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.run_manifest import RunManifest
+from bricktrack_common.wire_codec import decode_reply, encode_message
 from bricktrack_common.wire_messages import (
     Arm,
     Armed,
@@ -28,8 +29,6 @@ from bricktrack_common.wire_messages import (
     Request,
     RunList,
     StatusReply,
-    decode_reply,
-    encode_message,
 )
 from bricktrack_device.network.connection_guard import MAX_CONNECTIONS
 

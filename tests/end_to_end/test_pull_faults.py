@@ -24,7 +24,8 @@ from run_folders import make_run
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import BricktrackError, StorageError, TransferError, UnitError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest, write_manifest
-from bricktrack_common.wire_messages import Confirm, DescribeRun, Read, RunDescription, encode_message
+from bricktrack_common.wire_codec import encode_message
+from bricktrack_common.wire_messages import Confirm, DescribeRun, Read, RunDescription
 from bricktrack_host.transfer.contact import Dialer
 from bricktrack_host.transfer.fleet_config import UnitConfig
 from bricktrack_host.transfer.pull import PullSettings, pull_unit

@@ -16,13 +16,8 @@ from fake_unit import FakeUnit
 from run_folders import contents, make_run
 
 from bricktrack_common.errors import ConfigError, StorageError, TransferError, UnitTimeoutError
-from bricktrack_common.wire_messages import (
-    DescribeRun,
-    FileSummary,
-    Read,
-    RunDescription,
-    encode_message,
-)
+from bricktrack_common.wire_codec import encode_message
+from bricktrack_common.wire_messages import DescribeRun, FileSummary, Read, RunDescription
 from bricktrack_host.transfer import part_folder
 from bricktrack_host.transfer.contact import Dialer
 from bricktrack_host.transfer.fleet_config import UnitConfig, unit_at

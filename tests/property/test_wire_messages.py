@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from bricktrack_common.clocks import read_clock_triplet
 from bricktrack_common.errors import ProtocolError
+from bricktrack_common.wire_codec import VersionError, decode_reply, decode_request, encode_message
 from bricktrack_common.wire_messages import (
     MAX_HEADER_BYTES,
     PROTOCOL_MINOR,
@@ -26,10 +27,6 @@ from bricktrack_common.wire_messages import (
     Refusal,
     StatusReply,
     TakeStill,
-    VersionError,
-    decode_reply,
-    decode_request,
-    encode_message,
 )
 
 run_ids = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,40}", fullmatch=True)

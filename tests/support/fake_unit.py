@@ -10,6 +10,7 @@ import zmq
 from bricktrack_common.checksums import crc32
 from bricktrack_common.clocks import read_clock_triplet
 from bricktrack_common.run_manifest import MANIFEST_NAME, file_entry, read_manifest
+from bricktrack_common.wire_codec import decode_request, encode_message
 from bricktrack_common.wire_messages import (
     Arm,
     Armed,
@@ -37,8 +38,6 @@ from bricktrack_common.wire_messages import (
     StatusReply,
     StillImage,
     TakeStill,
-    decode_request,
-    encode_message,
 )
 from bricktrack_host.transfer.software import own_software
 

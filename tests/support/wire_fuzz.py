@@ -13,6 +13,7 @@ from bricktrack_common.clocks import ClockTriplet
 from bricktrack_common.discovery import parse_announcement
 from bricktrack_common.errors import BricktrackError, ConfigError, ProtocolError
 from bricktrack_common.key_files import check_public_key
+from bricktrack_common.wire_codec import VersionError, decode_reply, decode_request, encode_message
 from bricktrack_common.wire_messages import (
     MAX_CHUNK_BYTES,
     MAX_HEADER_BYTES,
@@ -44,10 +45,6 @@ from bricktrack_common.wire_messages import (
     StatusReply,
     StillImage,
     TakeStill,
-    VersionError,
-    decode_reply,
-    decode_request,
-    encode_message,
 )
 from bricktrack_device.network.file_server import Answer, FileServer
 from bricktrack_host.transfer.unit_client import UnitClient

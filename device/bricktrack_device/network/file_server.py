@@ -19,6 +19,7 @@ import msgpack
 import zmq
 
 from bricktrack_common.errors import DeviceError, ProtocolError
+from bricktrack_common.wire_codec import VersionError, decode_request, encode_message
 from bricktrack_common.wire_messages import (
     MAX_CHUNK_BYTES,
     MAX_HEADER_BYTES,
@@ -27,9 +28,6 @@ from bricktrack_common.wire_messages import (
     Refusal,
     Reply,
     Request,
-    VersionError,
-    decode_request,
-    encode_message,
 )
 from bricktrack_device.network.connection_guard import ConnectionGuard
 from bricktrack_device.network.gatekeeper import ZAP_DOMAIN, Gatekeeper

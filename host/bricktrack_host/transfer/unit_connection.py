@@ -15,6 +15,7 @@ import zmq
 
 from bricktrack_common.errors import ConfigError, ProtocolError, UnitError, UnitTimeoutError
 from bricktrack_common.key_files import KeyPair, check_public_key
+from bricktrack_common.wire_codec import VersionError, decode_reply, encode_message
 from bricktrack_common.wire_messages import (
     MAX_CHUNK_BYTES,
     MAX_STILL_BYTES,
@@ -23,9 +24,6 @@ from bricktrack_common.wire_messages import (
     Reply,
     Request,
     StillImage,
-    VersionError,
-    decode_reply,
-    encode_message,
 )
 from bricktrack_host.transfer.handshake_watch import HandshakeWatch
 

@@ -6,7 +6,8 @@ import sys
 FIRST_MESSAGES_AT_ONCE = """
 import sys, threading
 sys.setswitchinterval(1e-6)
-from bricktrack_common.wire_messages import Hello, decode_request, encode_message
+from bricktrack_common.wire_codec import decode_request, encode_message
+from bricktrack_common.wire_messages import Hello
 message, together = encode_message(1, Hello(software="x")), threading.Barrier(100)
 def decode():
     together.wait()

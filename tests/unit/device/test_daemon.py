@@ -12,6 +12,7 @@ from device_fakes import FakeCamera, FakeRig
 
 from bricktrack_common.checksums import crc32, sha256_bytes
 from bricktrack_common.errors import DeviceError, StorageError
+from bricktrack_common.wire_codec import decode_reply, encode_message
 from bricktrack_common.wire_messages import (
     Arm,
     Armed,
@@ -38,8 +39,6 @@ from bricktrack_common.wire_messages import (
     StatusReply,
     StillImage,
     TakeStill,
-    decode_reply,
-    encode_message,
 )
 from bricktrack_device.config import DeviceConfig, RecordingTable, ServerTable, StorageTable, UnitTable
 from bricktrack_device.daemon import Daemon

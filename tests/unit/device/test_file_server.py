@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bricktrack_common.errors import DeviceError
+from bricktrack_common.wire_codec import decode_reply, encode_message
 from bricktrack_common.wire_messages import (
     MAX_HEADER_BYTES,
     Arm,
@@ -22,8 +23,6 @@ from bricktrack_common.wire_messages import (
     Refusal,
     Reply,
     Request,
-    decode_reply,
-    encode_message,
 )
 from bricktrack_device.network.file_server import Answer, FileServer
 from bricktrack_device.refusals import RequestRefusedError

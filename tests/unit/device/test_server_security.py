@@ -12,14 +12,8 @@ import zmq
 
 from bricktrack_common.errors import DeviceError
 from bricktrack_common.key_files import KeyPair, make_key_pair, write_public_key, write_secret_key
-from bricktrack_common.wire_messages import (
-    Hello,
-    HelloReply,
-    Refusal,
-    Request,
-    decode_reply,
-    encode_message,
-)
+from bricktrack_common.wire_codec import decode_reply, encode_message
+from bricktrack_common.wire_messages import Hello, HelloReply, Refusal, Request
 from bricktrack_device.network import connection_guard, file_server
 from bricktrack_device.network.connection_guard import ConnectionGuard
 from bricktrack_device.network.file_server import Answer, FileServer

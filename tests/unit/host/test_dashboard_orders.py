@@ -7,7 +7,8 @@ from fake_unit import FakeUnit
 from run_folders import contents, make_run
 
 from bricktrack_common.errors import UnitError
-from bricktrack_common.wire_messages import Arm, Read, Refusal, decode_reply, encode_message
+from bricktrack_common.wire_codec import decode_reply, encode_message
+from bricktrack_common.wire_messages import Arm, Read, Refusal
 from bricktrack_host.dashboard.html_table import MOST_LISTED, Bar, html_table
 from bricktrack_host.dashboard.orders import Order, OrderBusyError, OrderDesk, OrderLine, Pulled
 from bricktrack_host.transfer.contact import Dialer

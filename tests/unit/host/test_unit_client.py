@@ -14,6 +14,7 @@ from run_folders import make_run
 
 from bricktrack_common.errors import ConfigError, ProtocolError, TransferError, UnitError, UnitTimeoutError
 from bricktrack_common.key_files import make_key_pair
+from bricktrack_common.wire_codec import encode_message
 from bricktrack_common.wire_messages import (
     MAX_CHUNK_BYTES,
     Arm,
@@ -23,7 +24,6 @@ from bricktrack_common.wire_messages import (
     Read,
     Refusal,
     TakeStill,
-    encode_message,
 )
 from bricktrack_host.transfer.unit_client import UnitClient
 from bricktrack_host.transfer.unit_connection import Stopped
