@@ -4,6 +4,8 @@ import os
 import threading
 from collections.abc import Callable
 
+from bricktrack_device.in_time import ThreadedCall
+
 NICENESS = 10
 
 
@@ -22,17 +24,11 @@ def at_low_priority(action: Callable[[], None]) -> None:
     Exception
         What the action raised.
     """
-    raised: list[BaseException] = []
 
     def run() -> None:
         lower_priority()
-        try:
-            action()
-        except BaseException as e:  # noqa: BLE001  raised again in the caller's thread
-            raised.append(e)
+        action()
 
-    thread = threading.Thread(target=run, name="low-priority")
-    thread.start()
-    thread.join()
-    if raised:
-        raise raised[0]
+    call = ThreadedCall(run, name="low-priority")
+    call.has_ended(within_s=None)
+    call.result()

@@ -9,7 +9,6 @@ from typing import Any
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_manifest import CameraSection
-from bricktrack_device.bounded import finishes
 from bricktrack_device.hardware.camera_checks import (
     ControlsCheck,
     FrameReport,
@@ -23,6 +22,7 @@ from bricktrack_device.hardware.packet_tap import MetadataTap, PacketTap, output
 from bricktrack_device.hardware.sensor_subdev import read_line_timing
 from bricktrack_device.hardware.versions import require
 from bricktrack_device.hardware.yuv import split_i420
+from bricktrack_device.in_time import finishes
 from bricktrack_device.interfaces import FrameSink, Still
 
 logger = logging.getLogger(__name__)

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 import msgspec
 
 from bricktrack_common.errors import BricktrackError, HardwareError
-from bricktrack_device.bounded import finishes
 from bricktrack_device.capture.ring import FrameRing
 from bricktrack_device.capture.trigger import Trigger
 from bricktrack_device.config import DeviceConfig, ImuTable
 from bricktrack_device.health.findings import CheckResult, good, tried
 from bricktrack_device.health.inertial import check_imu
+from bricktrack_device.in_time import in_time
 from bricktrack_device.interfaces import Rig
 
 logger = logging.getLogger(__name__)
@@ -93,17 +93,14 @@ def _try_camera(rig: Rig) -> list[CheckResult]:
 
 def _bounded(name: str, step: Step) -> list[CheckResult]:
     """Return what a step finds; one that hangs is left to its thread."""
-    found: list[CheckResult] = []
 
-    def run() -> None:
+    def run() -> list[CheckResult]:
         try:
-            found.extend(step())
+            return step()
         except (BricktrackError, OSError):
             raise
         except Exception as e:
             logger.exception("a bug in the self-test of %s", name)
             raise HardwareError(f"a bug in the self-test: {type(e).__name__}: {e}") from e
 
-    if not finishes(run, within_s=STEP_LIMIT_S, name=f"self-test: {name}"):
-        raise HardwareError(f"no answer within {STEP_LIMIT_S:g} s")
-    return found
+    return in_time(f"self-test of {name}", run, STEP_LIMIT_S, beat=lambda: None)

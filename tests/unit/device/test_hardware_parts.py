@@ -8,7 +8,6 @@ import pytest
 from gpiozero.pins.mock import MockFactory
 
 from bricktrack_common.errors import HardwareError
-from bricktrack_device.bounded import finishes
 from bricktrack_device.capture.ring import FrameRing
 from bricktrack_device.config import CameraTable, DeviceConfig
 from bricktrack_device.hardware import versions
@@ -16,6 +15,7 @@ from bricktrack_device.hardware.led_bank import LedBank
 from bricktrack_device.hardware.pi_camera import PiCamera
 from bricktrack_device.hardware.pi_rig import PiRig, camera_settings
 from bricktrack_device.hardware.smbus_i2c import SmbusOpener
+from bricktrack_device.in_time import finishes
 
 
 @pytest.mark.parametrize(
