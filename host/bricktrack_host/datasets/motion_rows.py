@@ -18,8 +18,6 @@ from bricktrack_host.results.export import read_run_table
 from bricktrack_host.results.result_store import RunResult, read_result, results_id, software_version
 from bricktrack_host.results.run_summary import key_figures, verdict
 
-_KINDS_OF_RUN = ("edge", "imu", "frame")
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComponentRows:
@@ -107,7 +105,7 @@ def unit_rows(source: UnitSource, source_id: str) -> "pa.Table":
     identity = results_id(source.results)
     schema = motion_schema(_metadata(source, result, identity, source_id))
     tables = [_camera_rows(source, result)] if source.with_camera_rows else []
-    tables += [_base_rows(source, rows) for rows in source.components]
+    tables += [_base_rows(rows.table) for rows in source.components]
     common = {
         "run_id": result.manifest.run_id,
         "results_id": identity,
@@ -130,11 +128,7 @@ def _camera_rows(source: UnitSource, result: RunResult) -> dict[str, Any]:
         [np.nan if x is None else x for x in table.column("edge_index").to_pylist()], dtype=np.float64
     )
     sample = np.where(at_edge, numbers, table.column("daq_sample").to_numpy()) + source.slip_samples
-    rows: dict[str, Any] = {
-        name: table.column(name).combine_chunks()
-        for name in table.column_names
-        if name in motion_schema().names and name != "sample"
-    }
+    rows = _columns_kept(table)
     for axis in "xyz":  # motion here is from rest; results of version 1 have the camera's own deviation alone
         if f"sd_drot_{axis}_deg" in table.column_names:
             rows[f"sd_rot_{axis}_deg"] = table.column(f"sd_drot_{axis}_deg").combine_chunks()
@@ -145,17 +139,18 @@ def _camera_rows(source: UnitSource, result: RunResult) -> dict[str, Any]:
     return rows
 
 
-def _base_rows(source: UnitSource, found: ComponentRows) -> dict[str, Any]:
-    table = found.table
-    rows: dict[str, Any] = {
-        name: table.column(name).combine_chunks()
-        for name in table.column_names
-        if name in motion_schema().names and name != "sample"
-    }
+def _base_rows(table: "pa.Table") -> dict[str, Any]:
+    rows = _columns_kept(table)
     rows["sample"] = table.column("sample").to_numpy().astype(np.float64)
     rows["kind"] = "edge"
     rows["seen_from"] = "base"
     return rows
+
+
+def _columns_kept(table: "pa.Table") -> dict[str, Any]:
+    """Return the columns that a dataset takes over as they are."""
+    names = (name for name in table.column_names if name in motion_schema().names and name != "sample")
+    return {name: table.column(name).combine_chunks() for name in names}
 
 
 def _in_schema(rows: Mapping[str, Any], common: Mapping[str, Any], schema: "pa.Schema") -> "pa.Table":
