@@ -9,8 +9,6 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_host.evaluation.scores import PAPER_RMS_MM, PAPER_WORST_ANGLE_DEG, SweepScore, rms
 
 COLUMNS = ("", "steps", "x, mm", "y, mm", "z, mm", "rotation, deg", "NEES / 6")
-LIMIT_MM, LIMIT_DEG = 0.04, 0.05
-"""What the product promises with full pictures."""
 
 
 def summary_rows(scores: Sequence[SweepScore], *, with_bound: bool) -> list[tuple[str, ...]]:
