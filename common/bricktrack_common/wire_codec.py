@@ -4,7 +4,7 @@ A message is ``{"protocol": 2, "minor": 0, "request_id": n, "body": {"type": ...
 behind it as raw ZeroMQ frames, never inside.
 """
 
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import msgpack
 import msgspec
@@ -20,6 +20,7 @@ from bricktrack_common.wire_messages import (
     Request,
 )
 
+T = TypeVar("T")
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 
@@ -61,10 +62,7 @@ def decode_request(data: bytes) -> tuple[int, Request]:
     if len(data) > MAX_HEADER_BYTES:
         raise ProtocolError(f"message header of {len(data)} bytes; at most {MAX_HEADER_BYTES} are allowed")
     message, minor = _unpack(data)
-    try:
-        envelope = convert(message, _RequestEnvelope, where="message", error=ProtocolError)
-    except ProtocolError as e:
-        raise _explained(e, minor) from e
+    envelope = _checked(message, _RequestEnvelope, minor)
     return envelope.request_id, envelope.body
 
 
@@ -76,10 +74,7 @@ def decode_reply(data: bytes) -> tuple[int, Reply]:
     message, minor = _unpack(data)
     if minor > PROTOCOL_MINOR:
         message = without_unknown_fields(message, _ReplyEnvelope)
-    try:
-        envelope = convert(message, _ReplyEnvelope, where="message", error=ProtocolError)
-    except ProtocolError as e:
-        raise _explained(e, minor) from e
+    envelope = _checked(message, _ReplyEnvelope, minor)
     return envelope.request_id, envelope.body
 
 
@@ -99,13 +94,17 @@ def _unpack(data: bytes) -> tuple[object, int]:
     return value, minor if isinstance(minor, int) else 0
 
 
-def _explained(error: ProtocolError, minor: int) -> ProtocolError:
-    if minor <= PROTOCOL_MINOR:
-        return error
-    return ProtocolError(
-        f"{error}. The message is of protocol {PROTOCOL_VERSION}.{minor}, this bricktrack speaks "
-        f"{PROTOCOL_VERSION}.{PROTOCOL_MINOR}: upgrade it"
-    )
+def _checked(message: object, envelope: type[T], minor: int) -> T:
+    """Return a message as what it must be; the error says where a newer version may be the reason."""
+    try:
+        return convert(message, envelope, where="message", error=ProtocolError)
+    except ProtocolError as e:
+        if minor <= PROTOCOL_MINOR:
+            raise
+        raise ProtocolError(
+            f"{e}. The message is of protocol {PROTOCOL_VERSION}.{minor}, this bricktrack speaks "
+            f"{PROTOCOL_VERSION}.{PROTOCOL_MINOR}: upgrade it"
+        ) from e
 
 
 # msgspec prepares a type when it is first used, and crashes where several threads do that at once: not later.

@@ -262,12 +262,25 @@ def check_config(config: DeviceConfig, *, where: str) -> None:
     places = [(i.bus, i.address) for i in config.imu]
     if len(set(places)) < len(places):
         raise ConfigError(f"{where}: imu: two sensors with the same bus and address; set one to 0x29")
+    pins = [_plain_pin(p) for p in config.leds.pins]
+    if len(set(pins)) < len(pins):
+        raise ConfigError(f"{where}: leds.pins: a pin stands twice in {config.leds.pins}; name each once")
+    if _plain_pin(config.trigger.pin) in pins:
+        raise ConfigError(
+            f"{where}: leds.pins: {config.trigger.pin} is the trigger's pin too: the unit would drive the "
+            "square wave's line. Give the LEDs another pin"
+        )
     period_us = _US_PER_S / config.camera.frame_rate_hz
     if config.camera.exposure_us >= period_us:
         raise ConfigError(
             f"{where}: camera.exposure_us: {config.camera.exposure_us} us does not fit the frame period "
             f"of {period_us:.0f} us at {config.camera.frame_rate_hz:g} Hz"
         )
+
+
+def _plain_pin(name: str) -> str:
+    """Return one name for GPIO17, BCM17 and 17; pins of the header's own numbering keep theirs."""
+    return name if name.startswith("BOARD") else name.lstrip("GPIOBCM").lstrip("0") or "0"
 
 
 def _check_address(server: ServerTable, where: str) -> None:

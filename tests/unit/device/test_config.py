@@ -60,6 +60,8 @@ def test_the_examples_commented_simulation_is_one_that_loads(tmp_path: Path) -> 
         ("[server]\nport = 70000", ["server.port"]),
         ("[unit]\nname = '../etc'", ["unit.name"]),
         ("[trigger]\npin = 'rm -rf'", ["trigger.pin"]),
+        ("[leds]\npins = ['GPIO22', '22']", ["leds.pins", "stands twice"]),
+        ("[trigger]\npin = 'GPIO7'\n[leds]\npins = ['BCM07']", ["leds.pins", "the trigger's pin too"]),
         ("[sim]\nno_such_key = 1", ["sim", "no_such_key"]),
         ("nonsense = [", ["not valid TOML"]),
     ],
