@@ -101,18 +101,25 @@ def _path() -> tuple[FloatArray, list[str], list[IntArray]]:
         turn[:, :3] = _MIDDLE_BRICK_MM - R @ _MIDDLE_BRICK_MM
         sweeps[f"rotation about {name}"] = turn
     n_turn = round(_TURN_S / _FRAME_S)
-    share = np.linspace(0, 1, n_turn + 1)[1:-1, None]
-    share = share**2 * (3 - 2 * share)
-    here, parts, spans, at = np.zeros(6), [], [], 0
+    rest = np.zeros((2, 6))
+    before, parts, spans, at = rest, [], [], 0
     for sweep in sweeps.values():
-        parts += [here + share * (sweep[0] - here), sweep]
-        at += len(share)
+        parts += [_turn(before, sweep, n_turn), sweep]
+        at += n_turn - 1
         # The first and last frames of a sweep still feel the turn before and after it.
         spans.append(np.arange(at + 2, at + len(sweep) - 2))
         at += len(sweep)
-        here = sweep[-1]
-    parts += [here + share * (0.0 - here), np.zeros((10, 6))]
+        before = sweep
+    parts += [_turn(before, rest, n_turn), np.zeros((10, 6))]
     return np.concatenate(parts), list(sweeps), spans
+
+
+def _turn(before: FloatArray, after: FloatArray, n: int) -> FloatArray:
+    """Return the ``n`` - 1 frames from one sweep's last to the next one's first, at either's speed there."""
+    s = np.arange(1, n)[:, None] / n
+    leaving, arriving = n * (before[-1] - before[-2]), n * (after[1] - after[0])
+    away = (1 - s) ** 2 * ((1 + 2 * s) * before[-1] + s * leaving)
+    return np.asarray(away + s**2 * ((3 - 2 * s) * after[0] - (1 - s) * arriving))
 
 
 def _write_motion(path: Path, motion: FloatArray) -> None:
