@@ -1,6 +1,7 @@
 """The pins: gpiozero over lgpio and nothing else, because only lgpio hands on the kernel's edge stamps."""
 
 import atexit
+import logging
 import os
 import re
 import shutil
@@ -16,6 +17,8 @@ from bricktrack_device.hardware.versions import require
 
 if TYPE_CHECKING:
     import gpiozero
+
+logger = logging.getLogger(__name__)
 
 GPIOZERO_MINIMUM = "2.0.1.post3"
 HEADER_CHIPS = ("pinctrl-rp1", "pinctrl-bcm2711", "pinctrl-bcm2835")
@@ -139,6 +142,27 @@ def choose_chip(lgpio: Any, *, dev: Path = Path("/dev")) -> int:
     )
 
 
+def never_raising(pin_class: type[Any]) -> type[Any]:
+    """Return gpiozero's lgpio pin, made safe to be given back while edges come.
+
+    lgpio has one thread for all reports of this process, and an error in one of them ends it: no edge would
+    be heard any more until the daemon starts anew. gpiozero raises such an error (TypeError) when a report is
+    under way while its pin is given back, as at the end of a run whose wave goes on.
+    """
+
+    class KernelStampPin(pin_class):  # type: ignore[misc]  # gpiozero has no types
+        """See `never_raising`."""
+
+        def _call_when_changed(self, chip: int, gpio: int, level: int, ticks: int) -> None:
+            try:
+                super()._call_when_changed(chip, gpio, level, ticks)
+            except Exception:
+                if self._when_changed is not None:
+                    logger.exception("a bug in taking an edge of GPIO%d; it is lost", gpio)
+
+    return KernelStampPin
+
+
 def open_pin_factory(*, working_directory: Path | None = None) -> "gpiozero.Factory":
     """Return a gpiozero factory whose pins carry kernel stamps.
 
@@ -156,10 +180,14 @@ def open_pin_factory(*, working_directory: Path | None = None) -> "gpiozero.Fact
         remedy=_INSTALL,
     )
     import gpiozero.exc
-    from gpiozero.pins.lgpio import LGPIOFactory
+    from gpiozero.pins.lgpio import LGPIOFactory, LGPIOPin
 
     class KernelStampFactory(LGPIOFactory):  # type: ignore[misc]  # gpiozero has no types
-        """LGPIOFactory, with lgpio's own errors in words."""
+        """LGPIOFactory, with lgpio's own errors in words, and pins that end no thread."""
+
+        def __init__(self, chip: int) -> None:
+            super().__init__(chip=chip)
+            self.pin_class = never_raising(LGPIOPin)
 
         def pin(self, name: object) -> Any:
             """Return a pin."""

@@ -3,13 +3,14 @@
 import os
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
 
 from bricktrack_common.errors import HardwareError
-from bricktrack_device.hardware.lgpio_pins import choose_chip
+from bricktrack_device.hardware.lgpio_pins import choose_chip, lgpio_working_directory, never_raising
 
 
 class FakeLgpio:
@@ -113,3 +114,33 @@ def test_lgpio_gets_a_writable_folder_and_the_process_its_own_back(tmp_path: Pat
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     assert "expected a folder that can be written" in in_a_process("/nowhere", cwd=tmp_path)[-1]
+
+
+def test_a_report_of_a_pin_that_was_just_given_back_does_not_end_lgpios_thread(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("lgpio")
+    with lgpio_working_directory(tmp_path):
+        from gpiozero.pins.lgpio import LGPIOPin
+
+    def report(pin_class: type) -> None:
+        pin = pin_class.__new__(pin_class)  # neither chip nor line: only what a report goes through
+        pin._when_changed = None
+        pin._call_when_changed(0, 17, 1, 5_000_000_000)
+
+    with pytest.raises(TypeError):  # gpiozero's own; lgpio's thread does not catch it
+        report(LGPIOPin)
+    report(never_raising(LGPIOPin))
+    assert caplog.text == ""
+
+    class Listened:
+        def hear(self, ticks_s: float, state: int) -> None:
+            raise ZeroDivisionError("a bug")
+
+    listened = Listened()
+    safe = never_raising(LGPIOPin)
+    pin = safe.__new__(safe)
+    pin._when_changed = weakref.WeakMethod(listened.hear)
+    pin._call_when_changed(0, 17, 1, 5_000_000_000)
+    assert "ZeroDivisionError" in caplog.text and "GPIO17" in caplog.text
+    pin._when_changed = None  # nothing to give back when it goes
