@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from bricktrack_host.tracking.led_fit import CollarFit
     from bricktrack_host.tracking.led_positions import PositionsFit
 
+_MUCH_PX = 0.2
+"""Of residuals: LEDs at their places leave 0.02 to 0.1 px, those 0.05 mm beside them 0.5 px (simulated)."""
+
 
 def leds(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run of the brick at rest in several poses.")],
@@ -94,9 +97,16 @@ def leds(
             )
             places = fit_positions(observations, rays, start, tolerance_mm=tolerance_mm, with_collar=True)
             moved = replace(brick, led_positions_mm=places.positions_mm)
-            fit = fit_collar(observations, rays, moved, start_mm=places.collar_mm)
-            fit = replace(fit, sd_mm=max(fit.sd_mm, places.collar_sd_mm))
+            fit = fit_collar(
+                observations, rays, moved, start_mm=places.collar_mm, least_sd_mm=places.collar_sd_mm
+            )
         _show_collar(fit, brick, simulated)
+        if places is None and fit.cross_validated_rms_px > _MUCH_PX:
+            out.print(
+                "That is much: 0.05 px is usual. Do the LEDs sit where the layout has them? --positions "
+                "finds that out from the same recording.",
+                style="yellow", markup=False, soft_wrap=True,
+            )  # fmt: skip
         if not fit.is_believable:
             raise CalibrationError(
                 f"{run}: the recording does not tell the profile: left-out frames fit no better with it. "

@@ -13,7 +13,7 @@ from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.tracks import FusedTrack
 
 MUCH_DROPPED = 0.01  # of the frames; one now and then harms nothing
-POOR_RESIDUAL_PX = 0.5  # several times what centroids of sharp dots and LEDs scatter, about 0.06 px
+POOR_RESIDUAL_PX = 0.3  # several times what centroids of sharp dots and LEDs scatter, about 0.06 px
 GAP_PERIODS = 1.5  # a longer time between two frame stamps is a dropped frame
 
 
@@ -167,7 +167,8 @@ def _flag_problems(result: RunResult, figures: KeyFigures) -> list[str]:
     if figures.residual_rms_px > POOR_RESIDUAL_PX:
         found.append(
             f"LEDs lie {figures.residual_rms_px:.2f} px rms from where the poses put them, where 0.1 px is "
-            "usual: check the layout, the calibration and the LED profile"
+            "usual: check the layout, the calibration and the LED profile. 'bricktrack calibrate leds "
+            "--positions' finds where the LEDs sit"
         )
     n_expected = figures.n_frames + figures.n_frames_dropped
     if figures.n_frames_dropped > MUCH_DROPPED * n_expected:

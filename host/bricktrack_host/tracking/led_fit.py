@@ -94,6 +94,7 @@ def fit_collar(
     brick_model: BrickModel,
     *,
     start_mm: float = 0.5,
+    least_sd_mm: float = 0.0,
     max_collar_radii: float = 2.0,
 ) -> CollarFit:
     """Fit the length of the lit collar of all LEDs of a layout.
@@ -106,6 +107,9 @@ def fit_collar(
     brick_model : BrickModel
         Its own profile, if any, is not used.
     start_mm : float
+    least_sd_mm : float
+        That the collar is known to at best: of LEDs whose places were fitted beside it, which these residuals
+        do not show.
     max_collar_radii : float
         Longest collar believed, in LED radii.
 
@@ -148,7 +152,7 @@ def fit_collar(
         out = folds == fold
         held_out[out] = problem.poses(problem.solve(~out, collar)).residual_px[out]
     without = problem.poses(None).residual_px
-    sd = max(sd, float(1 / np.sqrt(information.sum())))
+    sd = max(sd, float(1 / np.sqrt(information.sum())), least_sd_mm)
     return CollarFit(
         collar_mm=collar,
         sd_mm=sd,

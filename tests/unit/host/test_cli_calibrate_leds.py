@@ -73,7 +73,9 @@ def test_a_profile_and_positions_go_into_a_copy_of_the_layout(sweep, tmp_path, c
     sd_mm = float(re.search(r"sd ([\d.]+) mm", after.led_profile.source).group(1))
     assert after.led_profile.collar_mm == pytest.approx(0.8, abs=3 * sd_mm)
     assert 0.02 < sd_mm < 0.2
-    assert after.led_profile.shift_sd_per_radius < 0.01
+    # By the formula of the shift a collar of 1 mm moves the middle of the light, from afar and at 50 degrees,
+    # by 0.4 mm per sine: what the collar is unsure by, LEDs of 3 mm are.
+    assert after.led_profile.shift_sd_per_radius == pytest.approx(0.4 * sd_mm / 3.0, rel=0.4)
     assert "b2_sweep" in after.led_profile.source
     moved = after.led_positions_mm - before.led_positions_mm
     # It does not count in the gauge, so that it moves alone.
