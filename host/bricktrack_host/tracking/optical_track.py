@@ -103,9 +103,10 @@ def solve_poses(
     flags[first.is_ambiguous] |= PoseFlag.AMBIGUOUS
     uv, R, t_mm = first.uv_px, first.R_camera_brick, first.t_camera_brick_mm
     known_motion = motion
+    is_given = known_motion is not None or not rolling_shutter
     torn, twist_doubt = np.zeros(n, dtype=np.bool_), np.zeros((n, 6))
     for _ in range(_PASSES):
-        if rolling_shutter and known_motion is None:
+        if not is_given:
             motion = motion_to_leds(t_ns, led_t_ns, R, t_mm)
         n_before, n_torn = int(all_finite(uv).sum()), int(torn.sum())
         if motion is not None and motion.twist_sd is not None:
@@ -131,10 +132,12 @@ def solve_poses(
         moved_mm = np.abs(poses.t_camera_brick_mm - t_mm)
         R, t_mm = poses.R_camera_brick, poses.t_camera_brick_mm
         is_same = int(all_finite(uv).sum()) == n_before and int(torn.sum()) == n_torn
-        if is_same and not (moved_mm > _SETTLED_MM).any():
+        is_settled = is_given or not (moved_mm > _SETTLED_MM).any()
+        if is_same and is_settled:
             break
     else:
-        poses = fit(uv, R, t_mm, motion)
+        if not is_same:
+            poses = fit(uv, R, t_mm, motion)
     flags[torn] |= PoseFlag.IMPACT
     misfit = _misfit(poses, uv)[:, None, None]
     track = _finish(

@@ -187,6 +187,8 @@ def _believe_neighbours(
     t_ns: IntArray,
 ) -> None:
     """Settle frames with two poses by the frame beside them, if near one and far from the other."""
+    if not ambiguous.any():
+        return
     period = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
     row_of = {int(i): row for row, i in enumerate(frames)}
     for order in (range(len(t_ns)), range(len(t_ns) - 1, -1, -1)):
