@@ -24,7 +24,7 @@ from bricktrack_host.reporting.plots import (
 )
 from bricktrack_host.results.result_store import DetailValue, RunResult
 from bricktrack_host.results.run_summary import KeyFigures, main_track
-from bricktrack_host.results.truth import COMPONENTS, GroupErrors, TruthComparison
+from bricktrack_host.results.truth import COMPONENTS, GroupErrors, TruthComparison, groups_to_show
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +269,7 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
         ("From rest, brick axes at rest", truth.from_rest),
     ):
         if groups:
-            rows = [[*cells(g), *honesty(g)] for g in groups]
+            rows = [[*cells(g), *honesty(g)] for g in groups_to_show(groups)]
             section.tables.append(SectionTable(title, [*head, *names, "NEES/6", "in 95 %"], rows, 2))
     section.figures.append(
         embed_chart(quality_plots.truth_chart(result, figures, truth), "Errors against the truth over time",

@@ -286,6 +286,18 @@ def _snap(t_ns: IntArray, frames_ns: IntArray) -> IntArray:
     return np.asarray(frames_ns[np.abs(frames_ns[None, :] - t_ns[:, None]).argmin(axis=1)])
 
 
+def groups_to_show(groups: list[GroupErrors]) -> list[GroupErrors]:
+    """Return the groups without those "all" that one other holds alone, as optical poses without dropouts."""
+    alone = {
+        g.source
+        for a in groups
+        for g in groups
+        if (a.source, a.group, a.n, a.n_without) == (g.source, "all", g.n, g.n_without)
+        and g.group not in ("all", "extrapolated")
+    }
+    return [g for g in groups if g.group != "all" or g.source not in alone]
+
+
 def comparison_table(comparison: TruthComparison, *, from_rest: bool = False) -> Table:
     """Return the figures as a table for the terminal: root mean squares, below them largest magnitudes."""
     what = "displacements from rest, brick axes" if from_rest else "camera axes, nothing zeroed"
@@ -305,7 +317,7 @@ def comparison_table(comparison: TruthComparison, *, from_rest: bool = False) ->
         unit = "deg" if name.startswith("rot") else "mm"
         table.add_column(f"{name.replace('rot ', 'r')} {unit}", justify="right")
     table.add_column("95 %", justify="right")
-    for g in comparison.from_rest if from_rest else comparison.groups:
+    for g in groups_to_show(comparison.from_rest if from_rest else comparison.groups):
         if g.n:
             honest = f"{100 * g.nees_within_95:.0f} %"
             table.add_row(f"{g.source}, {g.group}", str(g.n), *(f"{x:.3f}" for x in g.rms), honest)

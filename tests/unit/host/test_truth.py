@@ -11,9 +11,10 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from bricktrack_common.arrays import rows_of
 from bricktrack_common.errors import RunFormatError, TrackingError
 from bricktrack_host.results.true_motion import read_true_motion
-from bricktrack_host.results.truth import compare_with_truth, comparison_table
+from bricktrack_host.results.truth import compare_with_truth, comparison_table, groups_to_show
 
 from .test_results import example
 
@@ -69,6 +70,18 @@ def test_groups_hold_each_instant_once(result, truth):
     assert group(comparison, "optical", "during dropouts").n_without in (10, 11)
     assert len(comparison.impacts_ns) == 1
     assert abs(comparison.impacts_ns[0] - example.T0_NS - example.IMPACT_S * 1e9) < 2e6
+
+
+def test_all_is_not_shown_beside_the_one_group_that_it_is_of(result, truth):
+    shown = {(g.source, g.group) for g in groups_to_show(compare_with_truth(result, truth).groups)}
+    assert {("optical", "all"), ("fused", "all"), ("optical", "during dropouts")} <= shown
+    calm = np.isfinite(result.optical.t_camera_brick_mm[:, 0]) & (
+        result.optical.t_ns < example.T0_NS + (example.IMPACT_S - 1.0) * 1e9
+    )
+    before_all = rows_of(result.optical, np.flatnonzero(calm)[:20])
+    groups = compare_with_truth(replace(result, optical=before_all), truth).groups
+    shown = [g.group for g in groups_to_show(groups) if g.source == "optical"]
+    assert shown == ["at frames"] and ("optical", "all") in {(g.source, g.group) for g in groups}
 
 
 def test_honest_covariances_give_unit_nees_and_small_ones_are_found_out(result, truth):
