@@ -91,13 +91,11 @@ def search_picture(
         ((rows - first + step - 1) // step, (columns - first + step - 1) // step), dtype=np.uint8
     )
     height, width = small.shape
-    brightest = 0
     for j in range(height):
-        row = (first + step * j) * stride + first
+        at = (first + step * j) * stride + first
         for i in range(width):
-            code = luma[row + step * i]
-            small[j, i] = code
-            brightest = max(brightest, code)
+            small[j, i] = luma[np.uint64(at + step * i)]  # unsigned: counts from no end
+    brightest = _brightest(small)
     places, half_sizes = np.empty((_MAX_CANDIDATES, 2)), np.empty((_MAX_CANDIDATES, 2))
     background = linear[_median_code(small[::3, ::3])]
     contrast = linear[brightest] - background
@@ -163,6 +161,16 @@ def _shape_flags(lights: FloatArray, rows: int, columns: int) -> IntArray:
 @compiled
 def _is_odd(light: FloatArray) -> bool:
     return bool(light[FILL] < _MIN_FILL or light[ECCENTRICITY] > _MAX_ECCENTRICITY)
+
+
+@compiled
+def _brightest(codes: Bytes) -> int:
+    highest = np.zeros(codes.shape[1], dtype=np.uint8)
+    for j in range(codes.shape[0]):
+        row = codes[j]
+        for i in range(len(row)):
+            highest[i] = max(highest[i], row[i])
+    return int(highest.max())
 
 
 @compiled
