@@ -23,7 +23,7 @@ $(READY): pyproject.toml constraints.txt
 
 setup: $(READY)  ## make the virtual environment .venv, and no more
 
-demo: $(READY)  ## record a simulated brick with the real daemon, pull it, process it, open the report
+demo: $(READY)  ## record a simulated brick with the real daemon, pull it, process it, write the report
 	$(BIN)/bricktrack demo --folder demo
 
 # A third worker saves two minutes, but simulated cameras then starve each other: it is no default.

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
+from bricktrack_host.campaign.test_plan import PLAN_NAME
 from bricktrack_host.cli._console import out, print_json
 from bricktrack_host.cli._progress import stage_of_counts
 from bricktrack_host.cli._units import FleetOption, JsonOption, fleet_path
@@ -46,6 +47,12 @@ def combine(
 
     path = fleet_path(fleet)
     config = load_fleet(path)
+    folder = output or path.resolve().parent / "tests" / name
+    if (folder / PLAN_NAME).exists():
+        raise ConfigError(
+            f"{folder} is a planned test's: 'bricktrack test report {name}' combines its runs. For others "
+            "give another --name, or --output"
+        )
     results: dict[str, Path] = {}
     for run in runs:
         unit = read_manifest(run / MANIFEST_NAME).unit
@@ -54,7 +61,6 @@ def combine(
                 f"{run}: unit {unit!r} has another run here, {results[unit].parent}; give one of them"
             )
         results[unit] = results_of(run)
-    folder = output or path.resolve().parent / "tests" / name
     with stage_of_counts() as progress:
         summary = combine_test(
             name, results, config.assembly, folder, also=write_combined_report, progress=progress

@@ -89,13 +89,13 @@ def new(
     chosen = choose_units(fleet, unit, None, timeout_s=timeout)
     folder = folder_of_test(fleet_path(fleet), name)
     plan = PlannedTest(name=name, units=[u.name for u in chosen.units], duration_s=duration)
-    save_plan(folder, plan)
     here = runs_here(_runs_folder(chosen), plan, load_round(folder))
     if here:
         raise ConfigError(
             f"the test {name} is recorded already: {len(here)} of its runs are here. Choose another name "
             f"for a new one; 'bricktrack test arm {name} --again' records this one once more"
         )
+    save_plan(folder, plan)
     _look(chosen, name)
 
 

@@ -154,6 +154,11 @@ def test_commands_name_what_is_wrong(lab, tmp_path):
     twice = invoke("combine", runs[0], runs[0], "--name", "x", "--fleet", lab / "fleet.toml")
     assert twice.exit_code != 0
     assert "has another run here" in " ".join(twice.output.split())
+    (lab / "tests" / "planned").mkdir(parents=True)
+    (lab / "tests" / "planned" / "plan.json").touch()
+    planned = invoke("combine", *runs, "--name", "planned", "--fleet", lab / "fleet.toml")
+    assert planned.exit_code == 1
+    assert "'bricktrack test report planned' combines its runs" in " ".join(planned.output.split())
     nothing = invoke("export", tmp_path)
     assert nothing.exit_code != 0
     assert "no such table" in " ".join(nothing.output.split())
