@@ -15,23 +15,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import av
+from bare_decode import bare_decode
 from recording_to_time import simulated_recording
 
 from bricktrack_common.run_folder import read_run
 from bricktrack_host.recordings.video_frames import DecodedFrame, decode_run_video
 from bricktrack_host.recordings.video_parts import work_on_frames
-
-
-def bare_decode(video: Path, threads: int) -> int:
-    """Decode with PyAV's own container reader and drop the pictures."""
-    n = 0
-    with av.open(str(video)) as container:
-        context = container.streams.video[0].codec_context
-        context.thread_type, context.thread_count = "AUTO", threads
-        for _ in container.decode(video=0):
-            n += 1
-    return n
 
 
 def main() -> None:

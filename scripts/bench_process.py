@@ -3,9 +3,10 @@
 The first time, 15 s, or ``--seconds``, are recorded with ``bricktrack demo``: the real daemon, simulated
 sensors, the pull. The recording stays under the system's temporary directory for the next time. Then, by turns,
 the video is decoded with as many threads and nothing done with its pictures, and the whole run is processed,
-from reading it to its report: in this process, as one of several runs is, or with ``--command`` by the command
-in a process of its own, which loads Python and all modules. Each processing is compared with the mean of the
-decodes just before and just after it. Ratios say more than times on a machine with other work:
+from reading it to its report: in this process, as one of several runs is, or with ``--command`` as from a shell,
+the command and the decode each in a process of its own, which loads Python and its modules. Each processing is
+compared with the mean of the decodes just before and just after it. Ratios say more than times on a machine
+with other work:
 
     python scripts/bench_process.py
     python scripts/bench_process.py --command
@@ -23,12 +24,13 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before NumPy is loaded
 
-from bench_decode import bare_decode
+from bare_decode import bare_decode
 from recording_to_time import DURATION_S, simulated_recording
 
 from bricktrack_common.run_folder import Run, read_run
@@ -135,14 +137,19 @@ def main() -> None:
         def command() -> None:
             _command(folder, calibration, layout, results)
 
-        work = command if options.command else here
+        def alone() -> None:
+            script = Path(__file__).with_name("bare_decode.py")
+            _run([str(script), str(video), "--threads", str(DECODER_THREADS)])
+
+        work: Callable[[], object] = command if options.command else here
+        floor = alone if options.command else partial(bare_decode, video, DECODER_THREADS)
         work()  # what is compiled and loaded once, and files read from the disk
         first = stages[0] if stages else StageClock()  # memory: later peaks are those of before
         stages.clear()
-        decode.time(lambda: bare_decode(video, DECODER_THREADS))
+        decode.time(floor)
         for _ in range(options.repeat):
             process.time(work)
-            decode.time(lambda: bare_decode(video, DECODER_THREADS))
+            decode.time(floor)
     print(decode.line(f"bare decode, {DECODER_THREADS} threads", n))
     print(process.line("the command" if options.command else "process", n))
     print("\nprocess / bare decode by its side: median, middle half, and range")
@@ -174,10 +181,15 @@ def _mode(run: Run) -> str:
 
 def _command(folder: Path, calibration: Path, layout: Path, results: Path) -> None:
     files = ["--calibration", str(calibration), "--layout", str(layout), "--output", str(results)]
-    command = [sys.executable, "-m", "bricktrack_host.cli", "process", str(folder), *files, "--again"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    _run(["-m", "bricktrack_host.cli", "process", str(folder), *files, "--again"])
+
+
+def _run(arguments: list[str]) -> None:
+    """Run Python with arguments, its modules kept compiled as on anybody's machine."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    done = subprocess.run([sys.executable, *arguments], env=kept, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"'bricktrack process' ended with {done.returncode}:\n{done.stderr}")
+        raise SystemExit(f"'python {' '.join(arguments)}' ended with {done.returncode}:\n{done.stderr}")
 
 
 def _cpu_s() -> float:
