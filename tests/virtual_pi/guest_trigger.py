@@ -98,3 +98,20 @@ def test_a_line_that_is_high_at_arming_is_said(factory):
     guest_knobs.drive(18, up=False)
     assert trigger.disarm().t0_ns is not None
     trigger.close()
+
+
+def test_pins_given_back_while_the_wave_goes_on_leave_the_next_one_hearing(factory):
+    wave = wave_of_at_most(500.0, 1500)
+    while wave.poll() is None:
+        trigger = Trigger(factory, TriggerTable())
+        trigger.arm(lambda: None)
+        time.sleep(0.01)
+        trigger.close()
+    guest_knobs.rises_of(wave)
+    trigger = Trigger(factory, TriggerTable())
+    trigger.arm(lambda: None)
+    rises = guest_knobs.rises_of(wave_of_at_most(100.0, 20))
+    time.sleep(0.3)
+    train = trigger.disarm()
+    trigger.close()
+    assert len(rises) == 20 and len(train.edges_ns) == 20

@@ -7,11 +7,13 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import HardwareError
 from bricktrack_device.hardware.versions import require
 
@@ -19,6 +21,9 @@ if TYPE_CHECKING:
     import gpiozero
 
 logger = logging.getLogger(__name__)
+
+_BUSY_S = 1.0
+_BUSY_POLL_S = 0.01
 
 GPIOZERO_MINIMUM = "2.0.1.post3"
 HEADER_CHIPS = ("pinctrl-rp1", "pinctrl-bcm2711", "pinctrl-bcm2835")
@@ -142,16 +147,27 @@ def choose_chip(lgpio: Any, *, dev: Path = Path("/dev")) -> int:
     )
 
 
-def never_raising(pin_class: type[Any]) -> type[Any]:
-    """Return gpiozero's lgpio pin, made safe to be given back while edges come.
+def sturdy(pin_class: type[Any], lgpio_error: type[Exception]) -> type[Any]:
+    """Return gpiozero's lgpio pin, made safe to be given back while edges come, as at the end of most runs.
 
     lgpio has one thread for all reports of this process, and an error in one of them ends it: no edge would
     be heard any more until the daemon starts anew. gpiozero raises such an error (TypeError) when a report is
-    under way while its pin is given back, as at the end of a run whose wave goes on.
+    under way while its pin is given back. And a line that lgpio still listens to for the moment is busy when
+    it is claimed for another use: that is tried again.
     """
 
     class KernelStampPin(pin_class):  # type: ignore[misc]  # gpiozero has no types
-        """See `never_raising`."""
+        """See `sturdy`."""
+
+        def close(self) -> None:
+            """Give the line back."""
+            _patiently(super().close, lgpio_error)
+
+        def _enable_event_detect(self) -> None:
+            _patiently(super()._enable_event_detect, lgpio_error)
+
+        def _disable_event_detect(self) -> None:
+            _patiently(super()._disable_event_detect, lgpio_error)
 
         def _call_when_changed(self, chip: int, gpio: int, level: int, ticks: int) -> None:
             try:
@@ -161,6 +177,18 @@ def never_raising(pin_class: type[Any]) -> type[Any]:
                     logger.exception("a bug in taking an edge of GPIO%d; it is lost", gpio)
 
     return KernelStampPin
+
+
+def _patiently(action: Callable[[], None], lgpio_error: type[Exception]) -> None:
+    """Do something to a line, again while it is busy, for `_BUSY_S` at most."""
+    deadline_ns = monotonic_ns() + round(_BUSY_S * 1e9)
+    while True:
+        try:
+            return action()
+        except lgpio_error as e:
+            if not _is_busy(e) or monotonic_ns() > deadline_ns:
+                raise
+        time.sleep(_BUSY_POLL_S)
 
 
 def open_pin_factory(*, working_directory: Path | None = None) -> "gpiozero.Factory":
@@ -187,7 +215,7 @@ def open_pin_factory(*, working_directory: Path | None = None) -> "gpiozero.Fact
 
         def __init__(self, chip: int) -> None:
             super().__init__(chip=chip)
-            self.pin_class = never_raising(LGPIOPin)
+            self.pin_class = sturdy(LGPIOPin, lgpio.error)
 
         def pin(self, name: object) -> Any:
             """Return a pin."""
@@ -213,6 +241,10 @@ def open_pin_factory(*, working_directory: Path | None = None) -> "gpiozero.Fact
 
 
 def _pin_advice(e: Exception) -> str:
-    if "busy" in str(e).lower():
+    if _is_busy(e):
         return "Another program or an overlay holds the line: 'gpioinfo' names it. Stop it or use another pin"
     return "Check trigger.pin"
+
+
+def _is_busy(e: Exception) -> bool:
+    return "busy" in str(e).lower()

@@ -10,7 +10,8 @@ from typing import ClassVar
 import pytest
 
 from bricktrack_common.errors import HardwareError
-from bricktrack_device.hardware.lgpio_pins import choose_chip, lgpio_working_directory, never_raising
+from bricktrack_device.hardware import lgpio_pins
+from bricktrack_device.hardware.lgpio_pins import choose_chip, lgpio_working_directory, sturdy
 
 
 class FakeLgpio:
@@ -130,7 +131,7 @@ def test_a_report_of_a_pin_that_was_just_given_back_does_not_end_lgpios_thread(
 
     with pytest.raises(TypeError):  # gpiozero's own; lgpio's thread does not catch it
         report(LGPIOPin)
-    report(never_raising(LGPIOPin))
+    report(sturdy(LGPIOPin, OSError))
     assert caplog.text == ""
 
     class Listened:
@@ -138,9 +139,35 @@ def test_a_report_of_a_pin_that_was_just_given_back_does_not_end_lgpios_thread(
             raise ZeroDivisionError("a bug")
 
     listened = Listened()
-    safe = never_raising(LGPIOPin)
+    safe = sturdy(LGPIOPin, OSError)
     pin = safe.__new__(safe)
     pin._when_changed = weakref.WeakMethod(listened.hear)
     pin._call_when_changed(0, 17, 1, 5_000_000_000)
     assert "ZeroDivisionError" in caplog.text and "GPIO17" in caplog.text
     pin._when_changed = None  # nothing to give back when it goes
+
+
+class BusyPin:
+    """A line that is busy for its first attempts, as one that lgpio still listens to."""
+
+    def __init__(self, n_busy: int, words: str = "GPIO busy") -> None:
+        self.n_attempts = 0
+        self.n_busy = n_busy
+        self.words = words
+
+    def close(self) -> None:
+        self.n_attempts += 1
+        if self.n_attempts <= self.n_busy:
+            raise FakeLgpio.error(self.words)
+
+
+def test_a_line_that_is_busy_for_a_moment_is_given_back_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    pin = sturdy(BusyPin, FakeLgpio.error)(3)
+    pin.close()
+    assert pin.n_attempts == 4
+    other = sturdy(BusyPin, FakeLgpio.error)(1, "bad handle")
+    with pytest.raises(FakeLgpio.error, match="bad handle"):
+        other.close()
+    monkeypatch.setattr(lgpio_pins, "_BUSY_S", 0.05)
+    with pytest.raises(FakeLgpio.error, match="busy"):
+        sturdy(BusyPin, FakeLgpio.error)(10**6).close()
