@@ -6,12 +6,15 @@ no interval is ever computed from the real-time clock.
 """
 
 import time
+from collections.abc import Callable
 
 import msgspec
 
 from bricktrack_common.errors import HardwareError
 
 MAX_BOOTTIME_DIFFERENCE_NS = 1_000_000
+_CLOSE_NS = 50_000
+_MAX_READINGS = 20
 
 
 class ClockTriplet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -27,13 +30,27 @@ def monotonic_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
 
 
-def read_clock_triplet() -> ClockTriplet:
-    """Return the three clocks, the monotonic one being the middle of two readings around the others."""
-    before = monotonic_ns()
-    boot = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-    real = time.clock_gettime_ns(time.CLOCK_REALTIME)
-    after = monotonic_ns()
-    return ClockTriplet(monotonic_ns=(before + after) // 2, boottime_ns=boot, realtime_ns=real)
+def read_clock_triplet(*, clock: Callable[[int], int] = time.clock_gettime_ns) -> ClockTriplet:
+    """Return the three clocks, the monotonic one being the middle of two readings around the others.
+
+    Another thread may get the processor between two readings, for milliseconds on a busy unit: the clocks are
+    read again until they were read close together, and the closest of some readings is taken.
+
+    Parameters
+    ----------
+    clock : callable
+        Returns the clock of an id of `time.clock_gettime_ns`, ns.
+    """
+    readings: list[tuple[int, int, int, int]] = []
+    while len(readings) < _MAX_READINGS:
+        before = clock(time.CLOCK_MONOTONIC)
+        boot, real = clock(time.CLOCK_BOOTTIME), clock(time.CLOCK_REALTIME)
+        width = clock(time.CLOCK_MONOTONIC) - before
+        readings.append((width, before + width // 2, boot, real))
+        if width <= _CLOSE_NS:
+            break
+    _, middle, boot, real = min(readings)
+    return ClockTriplet(monotonic_ns=middle, boottime_ns=boot, realtime_ns=real)
 
 
 def check_monotonic_is_boottime(triplet: ClockTriplet) -> None:
