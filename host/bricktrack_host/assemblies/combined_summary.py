@@ -11,7 +11,8 @@ import pyarrow as pa
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.typed_data import convert, load_json
 from bricktrack_host.durable_files import kept_beside
-from bricktrack_host.results.result_store import Details, Provenance, read_parquet
+from bricktrack_host.results.result_store import Details, Provenance
+from bricktrack_host.results.table_files import read_parquet
 
 TEST_SCHEMA = "bricktrack.test"
 TEST_VERSION = 1

@@ -12,7 +12,7 @@ import scipy.io
 
 from bricktrack_common.errors import RunFormatError
 from bricktrack_host.durable_files import rename_durably, storage_errors, sync_file
-from bricktrack_host.results.result_store import read_parquet
+from bricktrack_host.results.table_files import read_parquet
 
 Format = Literal["csv", "mat", "parquet"]
 _MAT_NAME_MAX = 63  # of MATLAB; savemat cuts longer field names off at 31 unless told

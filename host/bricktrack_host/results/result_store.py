@@ -14,9 +14,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
 
 from bricktrack_common.arrays import IntArray
 from bricktrack_common.checksums import sha256_file
@@ -36,6 +33,7 @@ from bricktrack_host.results.result_tables import (
     optical_table,
 )
 from bricktrack_host.results.table_columns import CONVENTIONS
+from bricktrack_host.results.table_files import read_table, write_table
 from bricktrack_host.results.tables_to_tracks import fused_from_table, imu_from_table, optical_from_tables
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
@@ -252,9 +250,7 @@ def _write_files(result: RunResult, folder: Path) -> None:
     if result.edge_fit is not None:
         tables["edges"] = edges_table(result.edge_fit, t0_ns=t0_ns, metadata=metadata)
     for name, table in tables.items():
-        _pack(table, folder / f"{name}.parquet")
-        flat = table.drop_columns(["covariance"]) if "covariance" in table.column_names else table
-        pa.csv.write_csv(flat, folder / f"{name}.csv", pa.csv.WriteOptions(quoting_style="needed"))
+        write_table(table, folder, name)
     summary = _Summary(
         run_id=result.manifest.run_id,
         unit=result.manifest.unit,
@@ -273,13 +269,6 @@ def _write_files(result: RunResult, folder: Path) -> None:
     )
     (folder / SUMMARY_NAME).write_bytes(dump_json(summary))
     (folder / TIMINGS_NAME).write_bytes(dump_json(result.timings_s))
-
-
-def _pack(table: "pa.Table", path: Path) -> None:
-    """Write a Parquet table; what is measured hardly repeats, and dictionaries of it take time and room."""
-    types = pa.types
-    repeats = [c.name for c in table.schema if types.is_string(c.type) or types.is_integer(c.type)]
-    pa.parquet.write_table(table, path, compression="zstd", use_dictionary=repeats)  # type: ignore[arg-type]
 
 
 def read_provenance(folder: Path) -> Provenance:
@@ -302,7 +291,7 @@ def read_result(folder: Path) -> RunResult:
         If the folder holds no results, is of a newer version, or a table is missing or damaged.
     """
     summary = _read_summary(folder)
-    tables = {name: _read_table(folder / f"{name}.parquet", rows) for name, rows in summary.tables.items()}
+    tables = {name: read_table(folder / f"{name}.parquet", rows) for name, rows in summary.tables.items()}
     for name in ("optical", "fused", "leds"):
         if name not in tables:
             raise RunFormatError(f"{folder / SUMMARY_NAME}: tables: no '{name}'")
@@ -350,23 +339,6 @@ def _read_summary(folder: Path) -> _Summary:
             f"{RESULTS_VERSION}. Upgrade bricktrack on this machine"
         )
     return load_json(path, _Summary)
-
-
-def _read_table(path: Path, n_rows: int) -> Any:
-    if not path.is_file():
-        raise RunFormatError(f"{path}: missing. Process the run again")
-    table = read_parquet(path)
-    if table.num_rows != n_rows:
-        raise RunFormatError(f"{path}: {table.num_rows} rows; the summary says {n_rows}")
-    return table
-
-
-def read_parquet(path: Path) -> "pa.Table":
-    """Return one table; raise `RunFormatError` where it cannot be read."""
-    try:
-        return pa.parquet.read_table(path)
-    except (OSError, pa.ArrowException) as e:
-        raise RunFormatError(f"{path}: not a readable Parquet table: {e}") from e
 
 
 def _table_metadata(result: RunResult) -> dict[str, str]:

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from bricktrack_common.errors import RunFormatError, StorageError, TrackingError
 from bricktrack_common.poses import Pose
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.results import result_store as results_module
 from bricktrack_host.results.ray_errors import RayErrors
 from bricktrack_host.results.rest_pose import tare
 from bricktrack_host.results.result_store import earlier_results, read_result, results_id, write_results
@@ -251,7 +250,7 @@ def test_a_full_disk_is_said_and_leaves_no_result(result, tmp_path, monkeypatch)
     def full(*_args, **_kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(results_module.pa.parquet, "write_table", full)
+    monkeypatch.setattr(pq, "write_table", full)
     with pytest.raises(StorageError, match="no space left"):
         write_results(result, tmp_path / "results")
     assert not (tmp_path / "results").exists()

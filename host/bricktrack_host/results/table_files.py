@@ -1,0 +1,46 @@
+"""Tables on disk: Parquet for programs, and CSV for everybody."""
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from bricktrack_common.errors import RunFormatError
+
+
+def write_table(table: "pa.Table", folder: Path, name: str) -> None:
+    """Write a table as Parquet, and as CSV without its covariances.
+
+    What is measured hardly repeats, and dictionaries of it take time and room: what repeats alone has one.
+    """
+    types = pa.types
+    repeats = [c.name for c in table.schema if types.is_string(c.type) or types.is_integer(c.type)]
+    path = folder / f"{name}.parquet"
+    pa.parquet.write_table(table, path, compression="zstd", use_dictionary=repeats)  # type: ignore[arg-type]
+    flat = table.drop_columns(["covariance"]) if "covariance" in table.column_names else table
+    pa.csv.write_csv(flat, folder / f"{name}.csv", pa.csv.WriteOptions(quoting_style="needed"))
+
+
+def read_table(path: Path, n_rows: int) -> "pa.Table":
+    """Return one table of so many rows.
+
+    Raises
+    ------
+    RunFormatError
+        If it is missing, cannot be read, or has another number of rows.
+    """
+    if not path.is_file():
+        raise RunFormatError(f"{path}: missing. Process the run again")
+    table = read_parquet(path)
+    if table.num_rows != n_rows:
+        raise RunFormatError(f"{path}: {table.num_rows} rows; the summary says {n_rows}")
+    return table
+
+
+def read_parquet(path: Path) -> "pa.Table":
+    """Return one table; raise `RunFormatError` where it cannot be read."""
+    try:
+        return pa.parquet.read_table(path)
+    except (OSError, pa.ArrowException) as e:
+        raise RunFormatError(f"{path}: not a readable Parquet table: {e}") from e
