@@ -20,7 +20,7 @@ from bricktrack_host.tracking.pictures.segment import Blobs
 COLLAR_MM = 0.7
 N_FALSE = 5
 _FALSE_AREA_PX2 = (900.0, 6000.0)
-BESIDE_PX = 40.0
+BESIDE_PX = 12.0  # of a brick at rest, lights farther from a hidden LED than some px are left out
 _PICTURE_PX = np.array([[20.0, 20.0], [1900.0, 1060.0]])  # where false lights are
 _APART_PX = 80.0  # an LED's diameter and some: nearer lights run together
 _AREA_SD = 0.1  # of the logarithm: what exposure and threshold make of an outline
