@@ -24,6 +24,7 @@ _NODE_S = 0.0025  # of the integrated gyro
 _KNOT_S = 0.5  # of the slow drift between integrated gyro and optics: its noise, bias and scale error
 _AMBIGUOUS_SIGMA = 5.0
 _GYRO_AXES_SD = 0.02  # of scales, and of axes in rad: consumer sensors, and a layout measured by hand
+_SETTLED_S = 1e-6  # a twentieth of the sharpest sd
 _ROBUST_ROUNDS = 4
 _MISFIT_CAP = 25.0
 LOSS_PRIOR_SD_S2 = 2e-5  # of c: 4.5 ms squared, the BNO055's narrower settings
@@ -181,7 +182,6 @@ class RotationFit:
         n, since_mid = len(t), t - self._t_mid
         self._gyro_bias, self._attitude = np.zeros(3), self._unbiased
         offset, skew, sd = float(offset_s), 0.0, float("nan")
-        covariance, bias_covariance = np.eye(3), np.eye(3)
         prior = np.diag([0.0, self._skew_prior_sd**-2, LOSS_PRIOR_SD_S2**-2])
         lost = 0.0
         weight = np.ones(n)
@@ -204,15 +204,15 @@ class RotationFit:
             # The median of sqrt(chi-square of 3 / 3) is 0.888.
             sd = max(float(np.median(residual)) / 0.888 / np.sqrt(freedom), 1e-6)
             weight = (1 + (residual / (2.5 * sd)) ** 2) ** -0.25  # soft-L1 by reweighting
-            covariance = np.linalg.inv(normal) * sd**2
             offset, skew = offset + float(np.clip(step[0], -0.02, 0.02)), skew + float(step[1])
             if iteration == 2:
                 # A bias left in turns the axes in which the errors are compared.
-                bias, bias_covariance = self._bias(t, segment[inside], attitude, drift, sd * self._sd[inside])
+                bias, _ = self._bias(t, segment[inside], attitude, drift, sd * self._sd[inside])
                 self._remove_bias(bias)
-            elif abs(step[0]) < 1e-7 and iteration > 3:
+            elif abs(step[0]) < _SETTLED_S and iteration > 3:
                 break
         bias, bias_covariance = self._bias(t, segment[inside], attitude, drift, sd * self._sd[inside])
+        covariance = np.linalg.inv(normal) * sd**2
         misfit = 3 * float(np.minimum(residual**2, _MISFIT_CAP * sd**2).sum())
         bias_sd = np.sqrt(np.diag(bias_covariance))
         return Fit(offset, skew, lost, self._gyro_bias + bias, bias_sd, covariance, sd, misfit, n)

@@ -1,9 +1,11 @@
 """The loops of `saw_tooth`, compiled: what optics and reads say of many saw-tooths."""
 
+from math import floor
+
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.compiled import compiled
+from bricktrack_host.compiled import compiled, compiled_inline
 
 
 @compiled
@@ -37,7 +39,7 @@ def optics_cost(
     for i in range(lags_s.shape[0]):
         least, most = lags_s[i].min(), lags_s[i].max()
         for m in range(n_bins):
-            age = (phases_s[i] - since_mid_s[m] * rate) % period_s - first_lag_s
+            age = _age(phases_s[i] - since_mid_s[m] * rate, period_s) - first_lag_s
             if age + least >= 0.0 and (age + most) * columns_per_s < n_table - 1:
                 for j in range(lags_s.shape[1]):
                     column = (age + lags_s[i, j]) * columns_per_s
@@ -72,7 +74,7 @@ def grid_cost(
     out = np.zeros((len(phases_s), n_lags))
     for m in range(n_bins):
         for i in range(len(phases_s)):
-            age = (phases_s[i] - since_mid_s[m] * rate) % period_s
+            age = _age(phases_s[i] - since_mid_s[m] * rate, period_s)
             column = (age + least_lag_s - first_lag_s) / lag_step_s
             at = min(max(int(column), 0), last)
             later = min(max(column - at, 0.0), 1.0)
@@ -81,6 +83,12 @@ def grid_cost(
                 k = at + stride * j
                 out[i, j] += earlier * table[m, k] + later * table[m, k + 1]
     return out
+
+
+@compiled_inline
+def _age(since_s: float, period_s: float) -> float:
+    """Return how old a sample of a clock is, 0 to a period; quicker than a remainder."""
+    return since_s - floor(since_s / period_s) * period_s
 
 
 @compiled
