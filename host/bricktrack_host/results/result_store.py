@@ -325,11 +325,19 @@ def read_result(folder: Path) -> RunResult:
     )
 
 
+def _why_no_results(folder: Path) -> str:
+    if folder.is_file():
+        return "a file; expected a processed run, or its results"
+    if any(folder.glob(f"*/{MANIFEST_NAME}")):
+        return "a folder of runs. Name one of them"
+    lacks = f"no {SUMMARY_NAME}; this is no results folder" if folder.is_dir() else "no such folder"
+    return f"{lacks}. Process the run first"
+
+
 def _read_summary(folder: Path) -> _Summary:
     path = folder / SUMMARY_NAME
     if not path.is_file():
-        lacks = f"no {SUMMARY_NAME}; this is no results folder" if folder.is_dir() else "no such folder"
-        raise RunFormatError(f"{folder}: {lacks}. Process the run first")
+        raise RunFormatError(f"{folder}: {_why_no_results(folder)}")
     head = load_json(path, dict[str, Any])
     if head.get("schema") != RESULTS_SCHEMA or not isinstance(head.get("version"), int):
         raise RunFormatError(f"{path}: not a {RESULTS_SCHEMA} summary")

@@ -171,3 +171,10 @@ def test_what_is_no_results_folder_is_told_from_what_is_not_there(tmp_path):
         read_result(tmp_path / "nowhere")
     with pytest.raises(RunFormatError, match=r"no summary\.json"):
         read_result(tmp_path)
+    (tmp_path / "b2_0001_shake").mkdir()
+    manifest = tmp_path / "b2_0001_shake" / "manifest.json"
+    manifest.touch()
+    with pytest.raises(RunFormatError, match=r"a folder of runs\. Name one"):
+        read_result(tmp_path)
+    with pytest.raises(RunFormatError, match=r"manifest\.json: a file; expected a processed run"):
+        read_result(manifest)
