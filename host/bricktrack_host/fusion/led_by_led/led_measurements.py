@@ -91,8 +91,10 @@ class Pictured:
         The predicted picture less the middle of the sensor's.
     from_side_rad : ndarray, shape (m, 2)
         How far beside an LED's mean line of sight, along the camera's first two axes, it is seen from.
-    is_facing : ndarray of bool, shape (m,)
-        Whether the dome can be seen at all from there.
+    facing : ndarray, shape (m,)
+        Cosine of the angle that the LED is seen at; at 0 and less nothing of the dome can be seen.
+    side_on_px : ndarray, shape (m, 2)
+        One radius along the LED's axis as it is seen.
     """
 
     R_camera_brick: FloatArray
@@ -102,7 +104,13 @@ class Pictured:
     profile_shift_px: FloatArray
     from_centre_px: FloatArray
     from_side_rad: FloatArray
-    is_facing: BoolArray
+    facing: FloatArray
+    side_on_px: FloatArray
+
+    @property
+    def is_facing(self) -> BoolArray:
+        """Whether the dome can be seen at all from there, shape (m,)."""
+        return np.asarray(self.facing > 0, dtype=np.bool_)
 
 
 def picture(
@@ -126,10 +134,11 @@ def picture(
         t_camera_brick_mm=t_camera_brick_mm[0],
         residual_px=leds.uv_px - 0.5 * (before.uv_px + after.uv_px),
         J_px=_by_pose(prediction, leds, R_camera_brick[0], brick),
-        profile_shift_px=prediction.model_shift_px,
+        profile_shift_px=shift_per_radius(collar_of(brick), brick) * prediction.model_shift_px,
         from_centre_px=prediction.uv_px - 0.5 * np.array([mode.width - 1, mode.height - 1]),
         from_side_rad=_from_side(leds, R_camera_brick[0], t_camera_brick_mm[0], brick),
-        is_facing=np.asarray(prediction.facing > 0, dtype=np.bool_),
+        facing=prediction.facing,
+        side_on_px=prediction.model_shift_px,
     )
 
 
@@ -145,7 +154,7 @@ def _from_side(leds: SeenLeds, R: FloatArray, t_mm: FloatArray, brick: BrickMode
 def _predict(
     leds: SeenLeds, R: FloatArray, t_mm: FloatArray, ray_model: RayModel, brick: BrickModel
 ) -> LedPrediction:
-    """Return predictions of single LEDs, shape (m,), each for its own pose."""
+    """Return predictions of single LEDs, shape (m,), each for its own pose; shifts are of whole radii."""
     P, N = brick.led_positions_mm[leds.led], brick.led_axes[leds.led]
     return predict_leds(
         np.einsum("mij,mj->mi", R, P) + t_mm,
@@ -153,7 +162,7 @@ def _predict(
         brick.led_radii_mm[leds.led],
         ray_model,
         collar_mm=collar_of(brick),
-        shift_sd_per_radius=shift_per_radius(collar_of(brick), brick),
+        shift_sd_per_radius=1.0,
     )
 
 

@@ -22,6 +22,7 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import Pictured, SeenLeds
 from bricktrack_host.fusion.led_by_led.leds_among_themselves import AmongThemselves
+from bricktrack_host.fusion.led_by_led.shape_errors import shape_covariance_px2
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
 from bricktrack_host.fusion.smoothing.camera_errors import (
     N_CAMERA_ERRORS,
@@ -134,12 +135,15 @@ class StandingPrior:
         Zero where none are believed.
     led_shift_px : ndarray, shape (L, 2)
         One standard deviation of each LED's profile, of which a share is its own.
+    shape_px2 : ndarray, shape (2 L, 2 L)
+        Of LEDs seen at other angles than the profile was fitted at; see `shape_errors`.
     camera_sd : ndarray, shape (23,), or (0,) where the camera stands still
     n_views : int
     """
 
     sensor_sd: FloatArray
     led_shift_px: FloatArray
+    shape_px2: FloatArray
     camera_sd: FloatArray
     n_views: int
 
@@ -156,11 +160,14 @@ class StandingPrior:
     ) -> "StandingPrior":
         """Return the belief for a run: the profile's share as it is on the mean over the run."""
         count = np.maximum(np.bincount(leds.led, minlength=n_leds), 1)
-        shift = [
-            np.bincount(leds.led, part, minlength=n_leds) / count for part in pictured.profile_shift_px.T
+        angle_rad = np.arccos(np.clip(pictured.facing, -1.0, 1.0))
+        mean = [
+            np.bincount(leds.led, part, minlength=n_leds) / count
+            for part in (angle_rad, *pictured.side_on_px.T, *pictured.profile_shift_px.T)
         ]
+        shape_px2 = shape_covariance_px2(mean[0], np.stack(mean[1:3], axis=1))
         camera_sd = camera_prior_sd(settings) if camera_moves else np.zeros(0)
-        return cls(sensor_prior_sd(settings), np.stack(shift, axis=1), camera_sd, n_views)
+        return cls(sensor_prior_sd(settings), np.stack(mean[3:], axis=1), shape_px2, camera_sd, n_views)
 
     def covariance(self, offset_sd_px: ArrayLike) -> FloatArray:
         """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...)."""
@@ -177,6 +184,7 @@ class StandingPrior:
             part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
             out[..., part, part] = np.outer(shift, shift)
         of_leds = at[_FIRST_LED:last_led]
+        out[..., of_leds[:, None], of_leds] += self.shape_px2
         out[..., of_leds, of_leds] += np.square(offset_sd_px)[..., None]
         of_profile = np.tile(np.repeat(0.5 * np.square(own).sum(axis=1), 2), self.n_views - 1)
         out[..., at[by_view], at[by_view]] = np.square(offset_sd_px)[..., None] + of_profile
