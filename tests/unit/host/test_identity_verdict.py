@@ -51,7 +51,7 @@ def verdict(proposals, *, off=(), collar=COLLAR):
 
 @pytest.mark.parametrize(
     ("off_px", "collar"),
-    [(1.5, COLLAR), (3.0, COLLAR), (3.0, None), (6.0, COLLAR), (6.0, None), (11.0, None)],
+    [(1.1, COLLAR), (1.5, COLLAR), (3.0, COLLAR), (3.0, None), (6.0, COLLAR), (6.0, None), (11.0, None)],
 )
 def test_a_false_light_within_the_gate_of_a_hidden_led_is_left_out(off_px, collar):
     # m0 and m4 are hidden: of a rigid brick at rest no light lies so far from where the others show the LED.

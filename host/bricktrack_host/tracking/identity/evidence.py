@@ -161,8 +161,8 @@ def evidence_of(
     -----
     Of a brick: each LED that faces the camera shows a light but for one in five; poses are alike likely
     wherever the camera sees a brick, at any roll, the likelier the better the LEDs face it. Of false lights:
-    each anywhere, their number by Poisson's law. By Markov's inequality false lights alone reach odds of x to
-    one in one picture out of x at most.
+    each anywhere, by a geometric law of their number. By Markov's inequality false lights alone reach odds of
+    x to one in one picture out of x at most.
     """
     n = len(kept)
     n_leds = kept.sum(axis=1)
