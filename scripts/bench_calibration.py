@@ -7,6 +7,7 @@ files to fitted rays. The sample's folder comes from ``BRICKTRACK_SAMPLES``. Exi
 place.
 """
 
+import argparse
 import csv
 import os
 import sys
@@ -34,6 +35,7 @@ SIZE = (1280, 720)
 
 
 def main() -> int:
+    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args()
     n_wrong = boards(coded=True) + boards(coded=False)
     root = os.environ.get("BRICKTRACK_SAMPLES")
     if root is None:
