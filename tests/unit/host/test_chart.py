@@ -73,6 +73,16 @@ def test_relative_steps_do_not_drift_over_many_samples():
     )
 
 
+def test_steps_across_the_whole_panel_are_as_exact_as_small_ones():
+    x, y = np.array([0.0, 1.0, 1.001, 0.0, 0.001]), np.array([1.0, -1.0, -0.999, 1.0, 0.999])
+    marks = Line(x, y, "#111111"), Scatter(x, y, "#222222", 1.0, half=np.full(5, 0.5))
+    chart, panel = one_panel(*marks, x_limits=(0.0, 1.0), y_limits=(-1.0, 1.0))
+    paths, _ = drawn(chart)
+    to = np.stack([panel.left_pt + panel.width_pt * x, panel.top_pt + panel.height_pt * (1 - y) / 2], axis=1)
+    np.testing.assert_allclose(corners(paths["#111111"]), to, atol=0.026)
+    np.testing.assert_allclose(corners(paths["#222222"]), to, atol=0.026)
+
+
 def test_nan_interrupts_lines_and_bands_and_draws_no_dot():
     x, y = np.arange(10.0), np.arange(10.0)
     y[4:6] = np.nan
