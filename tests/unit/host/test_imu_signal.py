@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import ImuFlag
-from bricktrack_host.fusion.inertial.imu_samples import clean_samples
-from bricktrack_host.fusion.inertial.imu_signal import ImuSignal, chain_rotations, roughness
+from bricktrack_host.fusion.inertial.imu_samples import clean_samples, roughness
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal, chain_rotations
 from bricktrack_host.tracks import ImuTrack
 
 EPOCH_NS = 5_000_000_000_000

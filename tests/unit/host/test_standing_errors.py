@@ -12,7 +12,7 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led import led_smoothing
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_smoothing import smooth_leds
-from bricktrack_host.fusion.led_by_led.standing_errors import StandingErrors, StandingWay, _likeliest
+from bricktrack_host.fusion.led_by_led.standing_errors import StandingWay, _likeliest
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.fusion.smoothing.smoother import POS, Filter
 from bricktrack_host.tracking.optical_track import solve_poses
@@ -145,10 +145,3 @@ def test_an_led_that_is_off_all_the_time_is_found():
     assert offset[4, 0] > 0.12
     assert done.errors.offset_sd_px > 0.03
     assert sd[4, 0] < 0.2
-
-
-def test_errors_stand_once_they_move_by_less_than_can_be_told():
-    sd = np.array([0.02, 0.3, 0.0])  # the last is not believed in, and never moves
-    before = StandingErrors(np.array([0.1, -1.0, 0.0]), np.diag(sd**2), 0.01, 0)
-    assert replace(before, value=before.value + 0.4 * sd).stand_since(before)
-    assert not replace(before, value=before.value + np.array([0.0, 0.6 * 0.3, 0.0])).stand_since(before)

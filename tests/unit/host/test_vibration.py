@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bricktrack_host.fusion.inertial.imu_signal import ImuSignal, roughness
+from bricktrack_host.fusion.inertial.imu_samples import roughness
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.inertial.vibration import (
     fill,
     interpolation_error,

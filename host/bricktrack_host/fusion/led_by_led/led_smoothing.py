@@ -145,7 +145,8 @@ def smooth_leds(
     errors = StandingErrors.before(first.run, lever_arm_m, n_leds, n_views=n_views)
     belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
     now, use = first, np.ones(len(sights.leds.t_ns), dtype=np.bool_)
-    for i in range(_MOST_PASSES):
+    i = 0
+    while True:
         ready = _prepared(sights, use, now, first, belief)
         if i == _NOISE_CHOSEN_IN:
             noise = choose_inertial_noise(
@@ -155,7 +156,8 @@ def smooth_leds(
                 belief, levels=noise.levels(belief.levels), settings=noise.settings(belief.settings)
             )
             ready = _prepared(sights, use, now, first, belief)
-        done, before = _pass(ready, first, belief), now
+        done = _pass(ready, first, belief)
+        moved_sds = _moved_sds(now, done.states)
         leds, now = sights.leds, done.states
         still = now.nodes.camera_attitudes(now.run)
         prior = StandingPrior.of(
@@ -166,8 +168,9 @@ def smooth_leds(
             of=now.estimate.of, n_views=n_views, R_still_camera=still,
         )  # fmt: skip
         errors = way.estimate(prior, belief.errors.value)
-        if i == _MOST_PASSES - 1 or (i > _NOISE_CHOSEN_IN and _moved_sds(before, now) < _STANDS_SDS):
-            break
+        if i == _MOST_PASSES - 1 or (i > _NOISE_CHOSEN_IN and moved_sds < _STANDS_SDS):
+            states = replace(now, estimate=way.with_doubt(now.estimate, errors))
+            return SmoothedLeds(leds, states, done.chi2, done.use, belief.scales, errors)
         scales = centroid_scales(done.chi2, sights.still, done.use, belief.scales)
         more = (scales / belief.scales)[sights.still.astype(np.int64)]
         use = (done.chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
@@ -176,8 +179,8 @@ def smooth_leds(
         if not done.holds():
             sights, placed = _sights(leds, now, ray_model, brick_model)
             use = use[placed]
-    states = replace(now, estimate=way.with_doubt(now.estimate, errors))
-    return SmoothedLeds(leds, states, done.chi2, done.use, belief.scales, errors)
+        i += 1
+        del ready, done, way  # the next pass makes its own: memory holds one
 
 
 def _moved_sds(before: Smoothed, now: Smoothed) -> float:

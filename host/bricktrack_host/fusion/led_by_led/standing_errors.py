@@ -37,7 +37,7 @@ from bricktrack_host.fusion.smoothing.sensor_errors import (
     sensor_prior_sd,
 )
 from bricktrack_host.fusion.smoothing.smoother import N_STATES, POS, Estimate, Filter, Problem
-from bricktrack_host.fusion.smoothing.standing_errors_kernel import carry_back, carry_forward
+from bricktrack_host.fusion.smoothing.standing_errors_kernel import Way, carry_back, carry_forward
 from bricktrack_host.tracking.pose.refine import OWN_SHARE
 
 _ARM = slice(18, N_ERRORS)
@@ -59,7 +59,7 @@ _HIDDEN_SHARE = np.sqrt(2)
 """Of single LEDs' errors, what is believed over what they show among themselves. To the pictures that show it
 the shape of the LEDs was fitted, and often their places: what looks like a pose was left. Recordings by
 another renderer than this project's had 1.4 times as much on the median (simulated)."""
-_STAND_SD = 0.5  # of an error: what is not yet taken out of the motion is not in its covariance
+_NODES_AT_ONCE = 64  # of the motion's doubt: more are only more memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,11 +107,6 @@ class StandingErrors:
         at = np.append(np.arange(N_ERRORS), np.arange(theirs, len(change)))
         camera = CameraErrors.of(change[theirs:]) if theirs < len(change) else None
         return SensorErrors(gyro, acc, change[_ARM], self.covariance[np.ix_(at, at)], camera)
-
-    def stand_since(self, before: "StandingErrors") -> bool:
-        """Return whether they are where they were, as far as can be told."""
-        change = np.abs(self.value - before.value)
-        return bool((change <= _STAND_SD * np.sqrt(np.diag(self.covariance))).all())
 
     def in_picture_px(self, leds: SeenLeds, pictured: Pictured) -> FloatArray:
         """Return by how much the centroids are off for them, shape (m, 2)."""
@@ -219,33 +214,24 @@ class StandingWay:
         n_views: int = N_VIEWS,
         R_still_camera: FloatArray | None = None,
     ) -> None:
-        m, n_nodes = len(leds.t_ns), len(problem.has_frame)
         self._camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, 0)
         own = _own_part(problem, leds, pictured, (n_leds, n_views), self._camera)
-        further = np.zeros((n_nodes - 1, 3, 0)) if self._camera is None else self._camera.velocity
+        further = np.zeros((len(problem.dt_s), 3, 0)) if self._camera is None else self._camera.velocity
         if problem.leds is None:
             raise ValueError("the problem has no LEDs")
         pictures = -own[:, :, _PROFILE : _FIRST_LED + 2 * n_leds]
         self._among_themselves = AmongThemselves.of(problem.leds, leds, pictures)
-        q, c = own.shape[2], len(of)
-        self._run, self._of, self._R = passed.runs[0], of, np.empty((n_nodes, 3, 3))
-        self._rows, self._changed = np.empty((n_nodes, c, N_STATES)), np.empty((n_nodes, c, q))
-        self._H, self._HP = np.empty((m, 2 * N_STATES)), np.empty((m, 2 * N_STATES))
-        self._y, self._dy = np.empty((m, 2)), np.empty((m, 2, q))
-        carry_forward(
-            self._run, np.ascontiguousarray(problem.gyro_var[:, 0]),
-            np.ascontiguousarray(problem.acc_var[:, 0]), problem.start.R[0].copy(), problem.start.x[0].copy(),
-            problem.P_start[0].copy(), own, further, of, self._R, self._rows, self._changed, self._H,
-            self._HP, self._y, self._dy,
-        )  # fmt: skip
+        q, kept = own.shape[2], passed.kept(0)
+        self._of, self._normal, self._pull = of, np.empty((q, q)), np.empty(q)
+        self._way = Way(passed.runs[0], *kept, own, further, np.empty((len(kept[-1]), N_STATES * q)))
+        carry_forward(self._way, self._normal, self._pull)
 
     def estimate(self, prior: StandingPrior, known: FloatArray) -> StandingErrors:
         """Return the likeliest errors and their covariance, where ``known``, shape (q,), was taken out.
 
         The sd of single LEDs' errors is the root of its mean square given what they say among themselves.
         """
-        dy, y = self._dy.reshape(-1, self._dy.shape[2]), self._y.ravel()
-        normal, pull = dy.T @ dy, dy.T @ y
+        normal, pull = self._normal, self._pull
         n_leds = len(prior.led_shift_px)
         part = slice(_PROFILE, _FIRST_LED + 2 * n_leds)
         of_pictures = prior.covariance(_OFFSET_SDS_PX)[:, part, part]
@@ -259,20 +245,26 @@ class StandingWay:
 
     def with_doubt(self, estimate: Estimate, errors: StandingErrors) -> Estimate:
         """Return smoothed states with what the errors leave unsure in their covariance."""
-        changed = self._changed.copy()
-        carry_back(self._run, self._R, self._H, self._HP, self._dy, self._rows, changed)
-        # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
-        at = np.searchsorted(self._of, np.arange(POS.start, POS.stop))[:, None]
-        changed[:, at, np.arange(_ARM.start, _ARM.stop)] -= self._R
-        if self._camera is not None:
-            state = estimate.state
-            theirs = self._camera.of_output(state.R[:, 0], state.x[:, 0, POS], self._of)
-            changed[:, :, -N_CAMERA_ERRORS:] += theirs
-        doubt = changed @ root_of(errors.covariance)
-        more = doubt @ np.swapaxes(doubt, 1, 2)
+        state, of = estimate.state, self._of
+        doubt = np.empty((len(state.x), len(of), len(self._pull)), dtype=np.float32)
+        carry_back(self._way, of, doubt)
         covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
-        covariance[:, 0] += more
-        variance[:, 0, self._of] += np.diagonal(more, axis1=1, axis2=2)
+        root, at = root_of(errors.covariance), np.searchsorted(of, np.arange(POS.start, POS.stop))[:, None]
+        theirs = None
+        if self._camera is not None:
+            theirs = self._camera.of_output(state.R[:, 0], state.x[:, 0, POS], of)
+        for start in range(0, len(doubt), _NODES_AT_ONCE):
+            nodes = slice(start, start + _NODES_AT_ONCE)
+            changed = doubt[nodes].astype(np.float64)
+            # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
+            changed[:, at, np.arange(_ARM.start, _ARM.stop)] -= state.R[nodes, 0]
+            if theirs is not None:
+                changed[:, :, -N_CAMERA_ERRORS:] += theirs[nodes]
+            of_nodes = changed @ root
+            more = of_nodes @ np.swapaxes(of_nodes, 1, 2)
+            covariance[nodes, 0] += more
+            variance[nodes, 0, of] += np.diagonal(more, axis1=1, axis2=2)
+            doubt[nodes] = of_nodes
         return replace(estimate, covariance=covariance, variance=variance, doubt=doubt[:, None])
 
 

@@ -7,14 +7,12 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
+from bricktrack_host.fusion.inertial.step_means_kernel import step_means
 from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraMotion
 from bricktrack_host.fusion.smoothing.linearisation import Linearisation
 
 _ONE_MISSING = 2.5  # periods between samples above which more than one is missing
 _NOISE_POINTS = 4  # of a step, over which its noise is averaged
-# Weights of neighbours. What is in proportion to a vibration turns its sign with it, before it adds up: at
-# 100 Hz this keeps 0.88 of what moves at 8 Hz, and 0.02 of what shakes at 37 Hz.
-_SMOOTH = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,26 +70,19 @@ def noise_parts(
 ) -> NoiseParts:
     """Return how far the inertial signal is to be trusted over the steps between instants of IMU time."""
     s, period, hold = settings, signal.period_s, settings.systematic_time_s
-    gyro = _without_vibration(signal.gyro_radps - lin.bg_radps)
-    turn = np.linalg.norm(np.gradient(gyro, signal.t_s, axis=0), axis=1)
-    size = np.linalg.norm(gyro, axis=1)
-    # What of the force is not constant in the body: the constant part is the bias state's.
-    force = _without_vibration(signal.acc_mps2)
-    moving = np.linalg.norm(force - np.median(force, axis=0), axis=1)
+    size = np.linalg.norm(signal.slow_gyro_radps - lin.bg_radps, axis=1)
+    turn, moving = signal.gyro_change_radps2, signal.force_change_mps2
     arm_m = s.lever_arm_sd_mm * 1e-3
 
-    points = t_s[:-1] + np.diff(t_s, axis=0) * ((np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS)[:, None]
+    share = (np.arange(_NOISE_POINTS) + 0.5) / _NOISE_POINTS
+    points = t_s[:-1].ravel()[:, None] + np.diff(t_s, axis=0).ravel()[:, None] * share
 
     fill = signal.samples.fill
     filled = np.zeros(points.shape, dtype=np.bool_) if fill is None else fill.covers(points)
     fill_gyro, fill_acc = (0.0, 0.0) if fill is None else (fill.gyro_density, fill.acc_density)
 
-    def at(values: FloatArray, shift_s: float) -> FloatArray:
-        """Return the mean over a step, but for what of it is filled: there no sample tells."""
-        return np.asarray((np.interp(points + shift_s, signal.t_s, values) * ~filled).mean(axis=0))
-
-    gap = hold * (signal.in_gap(points, least_periods=_ONE_MISSING) & ~filled).mean(axis=0)
-    bridged = period * (signal.in_gap(points) & ~filled).mean(axis=0)
+    gap = hold * (signal.in_gap(points, least_periods=_ONE_MISSING) & ~filled).mean(axis=1)
+    bridged = period * (signal.in_gap(points) & ~filled).mean(axis=1)
     gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
     shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
     acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2
@@ -102,32 +93,32 @@ def noise_parts(
     gyro_rough = np.maximum(signal.gyro_roughness_radps**2 - s.gyro_noise_radps**2, 0.0)
     acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
     acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2
+    of_gyro = gyro_fixed * period, gyro_rough * period, (s.gyro_scale_sd * size) ** 2 * hold
+    of_acc = acc_fixed * period, acc_rough * period, acc_systematic * hold
+    # Over a step, but for what of it is filled: there no sample tells.
+    gyro = step_means(signal.t_s, np.stack([*of_gyro, signal.gyro_bridge_radps], axis=1), points, ~filled)
+    acc = step_means(
+        signal.t_s, np.stack([*of_acc, signal.acc_bridge_mps2], axis=1), points + lin.lag_s, ~filled
+    )
     return NoiseParts(
-        gyro_fixed=at(gyro_fixed * period, 0.0)
-        + bridged * at(signal.gyro_bridge_radps, 0.0) ** 2
+        gyro_fixed=gyro[:, 0]
+        + bridged * gyro[:, 3] ** 2
         + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2
-        + filled.mean(axis=0) * fill_gyro,
-        gyro_rough=at(gyro_rough * period, 0.0),
-        gyro_systematic=at((s.gyro_scale_sd * size) ** 2 * hold, 0.0),
-        acc_fixed=at(acc_fixed * period, lin.lag_s)
-        + bridged * at(signal.acc_bridge_mps2, lin.lag_s) ** 2
+        + filled.mean(axis=1) * fill_gyro,
+        gyro_rough=gyro[:, 1],
+        gyro_systematic=gyro[:, 2],
+        acc_fixed=acc[:, 0]
+        + bridged * acc[:, 3] ** 2
         + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2
-        + filled.mean(axis=0) * fill_acc,
-        acc_rough=at(acc_rough * period, lin.lag_s),
-        acc_systematic=at(acc_systematic * hold, lin.lag_s),
+        + filled.mean(axis=1) * fill_acc,
+        acc_rough=acc[:, 1],
+        acc_systematic=acc[:, 2],
     )
 
 
 def _steepness(values: FloatArray, t_s: FloatArray) -> FloatArray:
     """Return how fast samples change, of the axis where it is most, shape (n,)."""
     return np.asarray(np.abs(np.gradient(values, t_s, axis=0)).max(axis=1))
-
-
-def _without_vibration(values: FloatArray) -> FloatArray:
-    """Return a signal, shape (n, 3), without what is faster than bricks move."""
-    side = len(_SMOOTH) // 2
-    padded = np.pad(values, ((side, side), (0, 0)), mode="edge")
-    return np.stack([np.convolve(axis, _SMOOTH, "valid") for axis in padded.T], axis=1)
 
 
 def camera_noise(

@@ -139,7 +139,7 @@ class Estimate:
     nis: FloatArray
     led_residual_px: FloatArray
     led_cov_px2: FloatArray
-    doubt: FloatArray | None = None
+    doubt: FloatArray | NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,6 +263,11 @@ class Filter:
     def _noise_of(self, b: int) -> tuple[FloatArray, FloatArray]:
         pr = self._problem
         return np.ascontiguousarray(pr.gyro_var[:, b]), np.ascontiguousarray(pr.acc_var[:, b])
+
+    def kept(self, b: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the inertial noise of one run and the states before every `CHUNK` nodes, to go on from."""
+        R, x, P = self._before
+        return *self._noise_of(b), R[b], x[b], P[b]
 
     def mean_nis(self, b: int) -> float:
         """Return the mean of `nis` of one run: 6 of frames, 2 of LEDs, when all is as believed."""
