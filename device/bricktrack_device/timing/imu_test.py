@@ -29,7 +29,6 @@ from bricktrack_device.timing.result_file import Result, make_result
 from bricktrack_device.timing.slot_statistics import PERCENTILES, figures_of, lateness_us
 from bricktrack_device.timing.text_histogram import text_histogram
 
-DEFAULT_SLOTS = 10_000
 BLOCK_SLOTS = 250
 PAPER_WORST_READ_MS = 8.53
 _SET_UP_S = 15.0

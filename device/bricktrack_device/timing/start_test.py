@@ -22,7 +22,6 @@ from bricktrack_device.timing.result_file import Result, make_result
 from bricktrack_device.timing.start_estimate import StartEstimate, estimate_start, initialisation_ms
 from bricktrack_device.timing.text_histogram import text_histogram
 
-DEFAULT_RUNS = 20
 PAPER_MEAN_MS, PAPER_SD_MS = 285.7, 16.86
 _FRAMES_COUNTED = 20
 _START_S = 40.0

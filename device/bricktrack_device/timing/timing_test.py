@@ -32,7 +32,6 @@ from bricktrack_device.timing.row_switches import (
 )
 from bricktrack_device.timing.text_histogram import text_histogram
 
-DEFAULT_SWITCHES = 60
 FRAMES_AHEAD = 5
 """How many frames before a switch it is planned: two of them are whole frames since the last one."""
 FRAMES_TO_ARRIVE = 3
