@@ -69,7 +69,12 @@ class DecodedFrame:
 
 
 def decode_run_video(
-    video: Path, frames: FrameTimes, *, threads: int = 2, part: range | None = None
+    video: Path,
+    frames: FrameTimes,
+    *,
+    threads: int = 2,
+    part: range | None = None,
+    decoder: VideoCodecContext | None = None,
 ) -> Generator[DecodedFrame, None, None]:
     """Yield every frame of a run, or of a part of it, in order, decoded or lost.
 
@@ -90,6 +95,8 @@ def decode_run_video(
         Of the decoder.
     part : range, optional
         Indices of frames, which begin where prediction begins anew; see `video_parts`. All if not given.
+    decoder : VideoCodecContext, optional
+        Of `open_decoder`, that decoded another part before: its memory serves again. A new one if not given.
 
     Raises
     ------
@@ -102,7 +109,7 @@ def decode_run_video(
         return
     try:
         with video.open("rb") as file:
-            yield from _Decoding(video, frames, threads, part).run(file)
+            yield from _Decoding(video, frames, part, decoder or open_decoder(threads)).run(file)
     except OSError as e:
         raise VideoError(f"{video}: {e.strerror or e}") from e
 
@@ -110,7 +117,7 @@ def decode_run_video(
 class _Decoding:
     """One pass over a video: what was fed, what was lost, what came out."""
 
-    def __init__(self, video: Path, frames: FrameTimes, threads: int, part: range) -> None:
+    def __init__(self, video: Path, frames: FrameTimes, part: range, decoder: VideoCodecContext) -> None:
         self._video = video
         self._frames = frames
         self._part = part
@@ -121,7 +128,7 @@ class _Decoding:
         self._next = part.start
         self._chain = ""  # why pictures until the next keyframe are lost; empty while all is well
         self._size: tuple[int, int] | None = None
-        self._codec = _open_decoder(threads)
+        self._codec = decoder
 
     def run(self, file: BinaryIO) -> Iterator[DecodedFrame]:
         if os.fstat(file.fileno()).st_size == 0:
@@ -222,7 +229,8 @@ class _Decoding:
         )
 
 
-def _open_decoder(threads: int) -> VideoCodecContext:
+def open_decoder(threads: int) -> VideoCodecContext:
+    """Return a decoder of H.264 with so many threads of its own."""
     codec = av.CodecContext.create("h264", "r")
     if not isinstance(codec, VideoCodecContext):
         raise VideoError("this PyAV has no H.264 decoder. Install the 'av' wheel from PyPI")

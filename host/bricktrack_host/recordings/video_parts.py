@@ -9,16 +9,17 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
-from threading import Event
-from typing import BinaryIO, TypeVar
+from threading import Event, local
+from typing import BinaryIO, TypeVar, cast
 
 import numpy as np
+from av.video.codeccontext import VideoCodecContext
 
 from bricktrack_common.errors import VideoError
 from bricktrack_common.frame_times import FrameTimes
 from bricktrack_host.recordings.annex_b import NAL_PPS, iter_nal_units
 from bricktrack_host.recordings.h264_headers import PictureOrder
-from bricktrack_host.recordings.video_frames import DecodedFrame, decode_run_video
+from bricktrack_host.recordings.video_frames import DecodedFrame, decode_run_video, open_decoder
 from bricktrack_host.tracking.pictures.look_ahead import look_ahead
 
 T = TypeVar("T")
@@ -93,11 +94,19 @@ def _side_by_side(
     threads: int,
     progress: Callable[[int], None] | None,
 ) -> list[T]:
-    stop = Event()
+    stop, own = Event(), local()
+
+    def decoder_of_thread() -> VideoCodecContext:
+        """Return one and the same for all parts of a thread: new memory for its pictures has its price."""
+        if hasattr(own, "decoder"):
+            own.decoder.flush_buffers()
+        else:
+            own.decoder = open_decoder(1)
+        return cast(VideoCodecContext, own.decoder)
 
     def work_on(part: range) -> list[T]:
         done: list[T] = []
-        with closing(decode_run_video(video, frames, threads=1, part=part)) as decoding:
+        with closing(decode_run_video(video, frames, part=part, decoder=decoder_of_thread())) as decoding:
             for frame in decoding:
                 if stop.is_set():
                     break
