@@ -58,7 +58,7 @@ FAST = SimSettings(shake_delay_s=0.03, square_wave_hz=500.0, clock_ppm=100.0, ed
 def test_edges_carry_the_wave_s_instants_however_late_they_are_heard() -> None:
     with listening(FAST, 60) as (world, listener, device):
         assert not device.value and not listener.changes  # low until the shake
-        assert listener.done.wait(5)
+        assert listener.done.wait(60)
         expected = world.edge_times_ns(0, 20)
         # gpiozero's ticks are float seconds: 1e-7 s at most after a year of up-time.
         np.testing.assert_allclose(listener.rising_ns[:20], expected, atol=200)
@@ -71,7 +71,7 @@ def test_edges_carry_the_wave_s_instants_however_late_they_are_heard() -> None:
 def test_stamps_jitter_as_much_as_told() -> None:
     settings = SimSettings(shake_delay_s=0.02, square_wave_hz=1000.0, clock_ppm=0.0, edge_jitter_us=20.0)
     with listening(settings, 400) as (world, listener, _):
-        assert listener.done.wait(5)
+        assert listener.done.wait(60)
         # By the nearest edge, not by number: a computer that stands still misses some.
         heard_ns, true_ns = np.array(listener.rising_ns[:200]), world.edge_times_ns(0, 2000)
         jitter_us = np.array([t - true_ns[np.abs(true_ns - t).argmin()] for t in heard_ns]) / 1e3
@@ -85,7 +85,7 @@ def test_a_missed_edge_is_never_heard_and_a_late_one_is_stamped_late() -> None:
         listener,
         _,
     ):
-        assert listener.done.wait(5)
+        assert listener.done.wait(60)
         true = world.edge_times_ns(0, 7)
         np.testing.assert_allclose(
             listener.rising_ns[:5], true[[1, 2, 4, 5, 6]] + [0, 0, 0, 700_000, 0], atol=200
@@ -105,7 +105,7 @@ def test_the_line_is_low_after_the_wave_stops_and_before_it_starts_anew() -> Non
             wave.start()
             assert not device.value
             listener.changes.clear()
-            assert listener.done.wait(5)
+            assert listener.done.wait(60)
             assert listener.rising_ns[0] == pytest.approx(world.edge_times_ns(0, 1)[0], abs=200)
             wave.stop()
             assert not device.value
@@ -115,7 +115,7 @@ def test_the_line_is_low_after_the_wave_stops_and_before_it_starts_anew() -> Non
 def test_outputs_are_not_driven_by_the_wave() -> None:
     with listening(FAST, 10) as (_, listener, device):
         led = gpiozero.DigitalOutputDevice("GPIO22", pin_factory=device.pin_factory, initial_value=True)
-        assert listener.done.wait(5)
+        assert listener.done.wait(60)
         assert led.value == 1
         led.close()
 
