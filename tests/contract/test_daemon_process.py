@@ -66,6 +66,7 @@ class Process:
             if found:
                 return int(found.group(1))
             time.sleep(0.02)
+        self.process.kill()
         raise AssertionError("\n".join(self.log))
 
     def ask(self, request: Request, timeout_ms: int = round(1000 * PATIENCE_S)) -> Reply:
