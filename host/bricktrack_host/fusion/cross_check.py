@@ -1,4 +1,4 @@
-"""Whether the tightly coupled motion is where the pose-level one allows it to be."""
+"""Whether the tightly coupled motion and the pose-level one are where both allow each other to be."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class CrossCheck:
     ----------
     rms_mm, max_mm, max_deg : float
     share_apart : float
-        Instants at which they are farther apart than the pose-level covariance allows one in 1000.
+        Instants at which they are farther apart than their covariances allow one in 1000.
     agrees : bool
         Whether those are few.
     """
@@ -33,14 +33,19 @@ class CrossCheck:
 
 
 def cross_check(track: FusedTrack, pose_level: FusedTrack) -> CrossCheck:
-    """Return how far two motions at the same instants are apart, by the covariance of the second."""
+    """Return how far two motions at the same instants are apart, by the covariances of both.
+
+    Were the second only the same less well known, its own covariance would do. But it knows nothing of some
+    errors that the first doubts, as of LEDs seen at other angles than their profile was fitted at, and lies
+    beside the first by them. Both see the same lights, so their sum is what they differ by at most.
+    """
     both = np.isfinite(track.t_camera_brick_mm[:, 0]) & np.isfinite(pose_level.t_camera_brick_mm[:, 0])
     if not both.any():
         return CrossCheck(np.nan, np.nan, np.nan, 1.0, agrees=False)
     turn = rvec_from_matrix(np.swapaxes(pose_level.R_camera_brick[both], 1, 2) @ track.R_camera_brick[both])
     shift = track.t_camera_brick_mm[both] - pose_level.t_camera_brick_mm[both]
     e = np.concatenate([turn, shift], axis=1)
-    allowed = normalised_squares(e, pose_level.covariance[both]) <= _DISAGREE_CHI2
+    allowed = normalised_squares(e, track.covariance[both] + pose_level.covariance[both]) <= _DISAGREE_CHI2
     apart = float(1.0 - allowed.mean())
     away = np.linalg.norm(shift, axis=1)
     return CrossCheck(

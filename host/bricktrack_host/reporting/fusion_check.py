@@ -32,7 +32,7 @@ class TwoFusions:
 
 
 def fusion_check_chart(result: RunResult, figures: KeyFigures, two: TwoFusions) -> Chart:
-    """Return the difference of both motions over time, in the band that the pose-level covariance allows."""
+    """Return the difference of both motions over time, in the band that both covariances allow."""
     order = np.argsort(two.by_leds.t_ns, kind="stable")
     t_ns = two.by_leds.t_ns[order]
     shift_mm = (two.by_leds.t_camera_brick_mm - two.by_poses.t_camera_brick_mm)[order]
@@ -40,7 +40,8 @@ def fusion_check_chart(result: RunResult, figures: KeyFigures, two: TwoFusions) 
     known = np.isfinite(turn).all(axis=(1, 2))
     turn_deg = np.full((len(turn), 3), np.nan)
     turn_deg[known] = np.rad2deg(rvec_from_matrix(turn[known]))
-    sd = np.sqrt(np.diagonal(two.by_poses.covariance, axis1=1, axis2=2))[order]
+    allowed_by_both = two.by_leds.covariance + two.by_poses.covariance  # as `fusion.cross_check` has it
+    sd = np.sqrt(np.diagonal(allowed_by_both, axis1=1, axis2=2))[order]
     axis = TimeAxis.of(result)
     chart = panel_grid(2, height_in=3.6, legend=True)
     for (panel,), values, allowed, words in zip(
@@ -72,7 +73,7 @@ def fusion_check_words(alignment: Details) -> list[str]:
         "The results are fused LED by LED, each at its own row's instant. The same run is fused pose by pose "
         f"as well, by another way from the pictures on. {verdict}: {rms_mm:.3f} mm apart rms, "
         f"{max_mm:.3f} mm and {max_deg:.3f} deg at most, and in {100 * float(str(beyond)):.1f} % of the "
-        "instants by more than the pose-level covariance allows one time in 1000."
+        "instants by more than their covariances allow one time in 1000."
     ]
 
 

@@ -154,6 +154,13 @@ def test_poses_that_are_wrong_together_are_noticed_by_the_cross_check():
     assert check.rms_mm == pytest.approx(0.4, abs=0.05)
 
 
+def test_what_one_of_both_ways_alone_doubts_is_no_disagreement():
+    # Simulated: LEDs stand 0.03 px beside their places. By the covariance of the poses alone both motions were
+    # farther apart than one in 1000 in 6 % of the instants.
+    run = simulate_run(51, duration_s=6.0, centroid_sd_px=0.03, standing_px=0.03)
+    assert fused(run).check.agrees
+
+
 def test_understated_centroid_noise_is_noticed():
     run = simulate_run(24, duration_s=5.0, centroid_sd_px=0.2)
     told = replace(run.observations, cov_px2=run.observations.cov_px2 / 16)
