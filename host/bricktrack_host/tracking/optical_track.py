@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
@@ -28,8 +28,10 @@ from bricktrack_host.tracking.pose.frame_motion import (
     motion_doubt_px2,
     motion_to_leds,
 )
+from bricktrack_host.tracking.pose.p3p import ray_centre_mm
 from bricktrack_host.tracking.pose.prsoi import PrsoiForm, prsoi_starts
 from bricktrack_host.tracking.pose.refine import MIN_LEDS, LedMotion, RefinedPoses, refine_poses
+from bricktrack_host.tracking.pose.twin_poses import better_of_twins
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
 __all__ = ["SegmentMethod", "led_times_ns", "observe_leds", "solve_poses", "start_poses"]
@@ -96,8 +98,19 @@ def solve_poses(
     collar_mm = collar_of(brick_model)
     cov = observations.cov_px2.copy()
 
-    def fit(uv: FloatArray, R: FloatArray, t: FloatArray, motion: LedMotion | None) -> RefinedPoses:
-        return refine_poses(uv, cov, R, t, ray_model, brick_model, collar_mm=collar_mm, motion=motion)
+    centre_mm = ray_centre_mm(ray_model)
+
+    def fit(
+        uv: FloatArray, R: FloatArray, t: FloatArray, motion: LedMotion | None
+    ) -> tuple[RefinedPoses, BoolArray]:
+        def fit_frames(rows: IntArray, R: FloatArray, t: FloatArray) -> RefinedPoses:
+            within = None if motion is None else rows_of(motion, rows)
+            return refine_poses(
+                uv[rows], cov[rows], R, t, ray_model, brick_model, collar_mm=collar_mm, motion=within
+            )
+
+        poses = fit_frames(np.arange(n), R, t)
+        return better_of_twins(poses, uv, t_ns, fit_frames, centre_mm, brick_model)
 
     first = first or start_poses(observations, ray_model, brick_model, form=form)
     flags[first.is_ambiguous] |= PoseFlag.AMBIGUOUS
@@ -111,7 +124,7 @@ def solve_poses(
         n_before, n_torn = int(all_finite(uv).sum()), int(torn.sum())
         if motion is not None and motion.twist_sd is not None:
             motion = replace(motion, twist_sd=np.maximum(motion.twist_sd, twist_doubt))
-        poses = fit(uv, R, t_mm, motion)
+        poses, is_twofold = fit(uv, R, t_mm, motion)
         newly = np.flatnonzero(_misfits(poses, uv) & ~torn) if motion is not None else _NO_FRAMES
         if motion is not None and newly.size:
             # Whatever motion was given, what a spline through the frames cannot follow here is in doubt.
@@ -137,14 +150,15 @@ def solve_poses(
             break
     else:
         if not is_same:
-            poses = fit(uv, R, t_mm, motion)
+            poses, is_twofold = fit(uv, R, t_mm, motion)
     flags[torn] |= PoseFlag.IMPACT
+    flags[is_twofold] |= PoseFlag.AMBIGUOUS
     misfit = _misfit(poses, uv)[:, None, None]
     track = _finish(
         observations,
         t_ns,
         led_t_ns,
-        poses.R_camera_brick,
+        np.where(is_twofold[:, None, None], np.nan, poses.R_camera_brick),
         poses.t_camera_brick_mm,
         poses.covariance * misfit,
         poses.residual_px,

@@ -19,8 +19,8 @@ from bricktrack_host.tracking.pose.prsoi import START_MM, PrsoiForm, prsoi_start
 from bricktrack_host.tracking.pose.refine import MIN_LEDS, RefinedPoses, refine_poses
 
 _DOUBT_CHI2_PER_DOF = 9.0
-_RIVAL_CHI2 = 9.0  # three sigma: below this two poses cannot be told apart
-_SAME_POSE_RAD = 0.02
+RIVAL_CHI2 = 9.0  # three sigma: below this two poses cannot be told apart
+SAME_POSE_RAD = 0.02
 _SAME_PLACE_MM = 2.0
 _QUICK_STEPS, _STEPS = 3, 20
 
@@ -111,10 +111,10 @@ def _other_starts(
     all_t = np.concatenate([t_try[posed], t_out[i, None]], axis=1)
     best = np.arange(len(posed)), np.argmin(all_chi2, axis=1)
     R_out[i], t_out[i] = all_R[best], all_t[best]
-    row, rival = np.nonzero(all_chi2 < all_chi2[best][:, None] + _RIVAL_CHI2)
+    row, rival = np.nonzero(all_chi2 < all_chi2[best][:, None] + RIVAL_CHI2)
     turn = rvec_from_matrix(np.swapaxes(R_out[i[row]], -1, -2) @ all_R[row, rival])
-    ambiguous[i[row[np.linalg.norm(turn, axis=1) > _SAME_POSE_RAD]]] = True
-    _believe_neighbours(ambiguous, R_out, t_out, R_try, t_try, chi2, frames, t_ns)
+    ambiguous[i[row[np.linalg.norm(turn, axis=1) > SAME_POSE_RAD]]] = True
+    believe_neighbours(ambiguous, R_out, t_out, R_try, t_try, chi2, frames, t_ns)
     R_out[ambiguous] = np.nan
     collar_mm = collar_of(brick_model)
     return refine_poses(uv, cov, R_out, t_out, ray_model, brick_model, collar_mm=collar_mm), ambiguous
@@ -159,7 +159,7 @@ def _poses_from_three(
     tries = fit(np.arange(len(of)), np.where(enough[:, None, None], R, np.nan), t, _QUICK_STEPS)
     turned = np.linalg.norm(rvec_from_matrix(np.swapaxes(own_R, -1, -2) @ tries.R_camera_brick), axis=1)
     apart_mm = np.linalg.norm(own_t - tries.t_camera_brick_mm, axis=1)
-    same = enough & (turned < 0.5 * _SAME_POSE_RAD) & (apart_mm < _SAME_PLACE_MM)
+    same = enough & (turned < 0.5 * SAME_POSE_RAD) & (apart_mm < _SAME_PLACE_MM)
     rows = quick[(~same & np.isfinite(tries.chi2))[quick]]
     if rows.size:
         again = fit(rows, tries.R_camera_brick[rows], tries.t_camera_brick_mm[rows], _STEPS - _QUICK_STEPS)
@@ -176,7 +176,7 @@ def _poses_from_three(
     )
 
 
-def _believe_neighbours(
+def believe_neighbours(
     ambiguous: BoolArray,
     R: FloatArray,
     t: FloatArray,
@@ -196,11 +196,11 @@ def _believe_neighbours(
         for i in order:
             if ambiguous[i] and before is not None and abs(int(t_ns[i] - t_ns[before])) < 1.5 * period:
                 row = row_of[i]
-                near = np.isfinite(chi2[row]) & (chi2[row] < np.nanmin(chi2[row]) + _RIVAL_CHI2)
+                near = np.isfinite(chi2[row]) & (chi2[row] < np.nanmin(chi2[row]) + RIVAL_CHI2)
                 index = np.flatnonzero(near)
                 turn = np.linalg.norm(rvec_from_matrix(R[before].T @ R_try[row, index]), axis=1)
                 rank = np.argsort(turn)
-                others = turn[rank][turn[rank] > turn[rank[0]] + _SAME_POSE_RAD]
+                others = turn[rank][turn[rank] > turn[rank[0]] + SAME_POSE_RAD]
                 if others.size == 0 or others[0] > 4 * turn[rank[0]] + 0.05:
                     pick = index[rank[0]]
                     R[i], t[i] = R_try[row, pick], t_try[row, pick]
