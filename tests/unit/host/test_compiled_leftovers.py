@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from bricktrack_host.compiled_leftovers import UNUSED_S, remove_unused_code
+from bricktrack_host.compiled_leftovers import LOOK_AGAIN_S, UNUSED_S, remove_unused_code
 
 NOW_S = 2_000_000_000
 
@@ -28,8 +28,14 @@ def cache(tmp_path):
 
 def test_only_what_was_long_not_used_goes(cache):
     assert remove_unused_code(cache, now_s=NOW_S) == 1
-    assert {p.name for p in cache.iterdir()} == {"00112233445566bb", "00112233445566cc", "somebody-elses"}
-    assert remove_unused_code(cache, now_s=NOW_S) == 0
+    kept = {p.name for p in cache.iterdir() if p.is_dir()}
+    assert kept == {"00112233445566bb", "00112233445566cc", "somebody-elses"}
+
+
+def test_the_folders_are_looked_through_only_now_and_then(cache):
+    assert remove_unused_code(cache, now_s=NOW_S) == 1
+    assert remove_unused_code(cache, now_s=NOW_S + LOOK_AGAIN_S - 1) == 0
+    assert remove_unused_code(cache, now_s=NOW_S + LOOK_AGAIN_S + 1) == 2
 
 
 def test_without_a_cache_there_is_nothing_to_do(tmp_path):
