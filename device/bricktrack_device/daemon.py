@@ -75,8 +75,7 @@ class Daemon:
                     "%s: recovered after a cut while it was being saved, or a damaged manifest", run_id
                 )
             if threading.current_thread() is threading.main_thread():
-                for number in STOP_SIGNALS:
-                    signal.signal(number, self.stop)
+                self._heed_signals()
             service.health.refresh_if_due(recorder.state)
             notify("STATUS=trying the sensors")
             service.health.test_hardware(self._stop.is_set)
@@ -89,6 +88,12 @@ class Daemon:
         finally:
             store.unlock()
             self._rig.close()
+
+    def _heed_signals(self) -> None:
+        for number in STOP_SIGNALS:
+            if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue  # started by nohup, to outlive its terminal
+            signal.signal(number, self.stop)
 
     def _advertisement(self, port: int, keys: UnitKeys | None) -> Advertisement:
         server = self._config.server

@@ -1,4 +1,5 @@
 import os
+import signal
 import socket
 import threading
 import time
@@ -41,7 +42,7 @@ from bricktrack_common.wire_messages import (
     TakeStill,
 )
 from bricktrack_device.config import DeviceConfig, RecordingTable, ServerTable, StorageTable, UnitTable
-from bricktrack_device.daemon import Daemon
+from bricktrack_device.daemon import STOP_SIGNALS, Daemon
 from bricktrack_device.interfaces import Still
 
 
@@ -243,6 +244,24 @@ def test_a_unit_told_to_arm_itself_says_so(unit: Unit) -> None:
     assert unit.status().auto_arm
     unit.ask(Disarm())
     assert not unit.status().auto_arm
+
+
+@pytest.fixture
+def signals_as_before() -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("signals_as_before")
+@pytest.mark.parametrize("by_nohup", [False, True])
+def test_a_lost_terminal_ends_a_daemon_unless_nohup_was_to_prevent_it(by_nohup: bool) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN if by_nohup else signal.SIG_DFL)
+    daemon = Daemon(DeviceConfig(), FakeRig())
+    daemon._heed_signals()
+    assert signal.getsignal(signal.SIGHUP) == (signal.SIG_IGN if by_nohup else daemon.stop)
+    assert signal.getsignal(signal.SIGTERM) == daemon.stop
 
 
 def test_a_second_daemon_on_the_same_folder_is_refused_before_it_touches_anything(
