@@ -76,13 +76,15 @@ def recover_runs(store: RunStore) -> list[str]:
 def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
     """Take up a run again whose manifest is no JSON any more; one of a newer version is left alone."""
     path = folder / MANIFEST_NAME
-    if not path.is_file():
-        return
-    try:
-        msgspec.json.decode(path.read_bytes())
-    except (msgspec.DecodeError, UnicodeDecodeError) as e:
-        logger.warning("%s: not valid JSON: %s; kept as %s%s", path, e, MANIFEST_NAME, DAMAGED_SUFFIX)
-        store.disk.rename(path, path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX))
+    aside = path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX)
+    if path.is_file():
+        try:
+            msgspec.json.decode(path.read_bytes())
+            return
+        except (msgspec.DecodeError, UnicodeDecodeError) as e:
+            logger.warning("%s: not valid JSON: %s; kept as %s", path, e, aside.name)
+        store.disk.rename(path, aside)
+    if aside.is_file():  # perhaps since a power cut between the two
         store.disk.rename(folder, folder.with_name(folder.name + PARTIAL_SUFFIX))
 
 

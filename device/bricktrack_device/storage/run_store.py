@@ -42,7 +42,7 @@ from bricktrack_device.storage.run_writer import PARTIAL_SUFFIX, RunWriter
 
 logger = logging.getLogger(__name__)
 
-_COUNTER_IN_ID = re.compile(r"_[0-9a-f]{6}_(\d{4,})(?:_|$)")
+_COUNTER_IN_ID = re.compile(r"_[0-9a-f]{6}_(\d{4,})(?:_|\.partial$|$)")
 _MAX_LISTED = 10_000
 
 

@@ -142,6 +142,10 @@ def test_numbers_go_on_over_restarts_and_a_lost_counter(tmp_path: Path) -> None:
     assert save_one(store_in(tmp_path)).endswith("_0003")
     (tmp_path / "next_run.json").write_text("garbage")
     assert store_in(tmp_path).new_run_id("x").endswith("_0004_x")
+    saved = next((tmp_path / "runs").glob("*_0003"))
+    saved.rename(saved.with_name(saved.name.replace("_0003", "_0007.partial")))  # as a cut leaves it
+    (tmp_path / "next_run.json").write_text("garbage")
+    assert store_in(tmp_path).new_run_id("").endswith("_0008")
 
 
 def n_steps_of_a_save(folder: Path) -> int:
@@ -230,6 +234,23 @@ def test_a_run_whose_manifest_is_damaged_is_taken_up_again(
     assert run.video is not None and run.video.stat().st_size == 100 * N_FRAMES
     assert path.with_name("manifest.json.damaged").exists()
     assert newer.read_text().endswith("99}")  # a newer bricktrack reads it
+
+
+def test_a_power_cut_while_a_damaged_run_is_taken_up_again_does_not_lose_it(tmp_path: Path) -> None:
+    cut_at, was_cut = 0, True
+    while was_cut:
+        cut_at += 1
+        folder = tmp_path / str(cut_at)
+        run_id = save_one(store_in(folder))
+        (folder / "runs" / run_id / "manifest.json").write_bytes(b"")
+        try:
+            recover_runs(RunStore(folder, "unit-1", disk=CutDisk(cut_at), boot_id=BOOT))
+            was_cut = False
+        except PowerCut:
+            recover_runs(store_in(folder))
+        run = read_run(folder / "runs" / run_id, verify_hashes=True)
+        assert run.manifest.trigger.t0_ns == T0 and run.video is not None
+    assert cut_at > 4  # two names, the new manifest, and its name
 
 
 def test_a_bug_in_a_recovery_leaves_the_folder_alone_and_the_unit_comes_up(
