@@ -82,8 +82,10 @@ def take_still(
             try:
                 return _picture_from(stream, lit=None if leds is None else lit, beat=beat)
             finally:
-                _stop(stream)
-                note_lost_camera(stream.lost)
+                try:
+                    _stop(stream)
+                finally:
+                    note_lost_camera(stream.lost)
     except HardwareError as e:
         raise RequestRefusedError("not-ready", f"no picture: {e}") from e
 

@@ -110,6 +110,15 @@ def test_the_simulated_camera_gives_a_picture_with_its_leds() -> None:
     assert 7 * 2800 < bright[True] - bright[False] < 7 * 4500
 
 
+def test_a_bug_in_stopping_the_camera_asks_for_a_new_start_too() -> None:
+    rig = FakeRig()
+    rig.camera.stop_error = RuntimeError("a bug")
+    lost: list[str] = []
+    with pytest.raises(RuntimeError, match="a bug"):
+        take_still(DeviceConfig(), rig, lit=True, beat=lambda: None, note_lost_camera=lost.append)
+    assert lost == ["a bug"]
+
+
 def test_giving_up_while_the_camera_starts_stops_it() -> None:
     class GiveUpError(Exception):
         pass
