@@ -187,13 +187,15 @@ class Recorder:
                     self._fail(f"lost while armed: {session.lost_required}. The unit will arm itself again")
             elif self.state == "recording" and session.is_over(monotonic_ns()):
                 self._finish()
-        elif self.state == "fault" and self._kept.run_id and time.monotonic() >= self._try_again_at:
+        elif time.monotonic() < self._try_again_at:
+            return
+        elif self.state == "fault" and self._kept.run_id:
             self._try_again_at = time.monotonic() + _RETRY_S
             if self._kept.has_room():
                 self._save_again()
-        elif self.state == "fault" and self._auto_arm and time.monotonic() >= self._try_again_at:
+        elif self.state == "fault" and self._auto_arm:
             self._change("disarm")
-        elif self.state == "idle" and self._auto_arm and time.monotonic() >= self._try_again_at:
+        elif self.state == "idle" and self._auto_arm:
             self._try_again_at = time.monotonic() + _RETRY_S
             try:
                 self._arm(self._config.recording.label, None)

@@ -31,6 +31,8 @@ LATE_EDGES_GRACE_NS = 100_000_000
 """How long after the window's end edges that were stamped within it may still be reported."""
 _STUCK_HIGH_NS = 5_000_000_000
 _POLL_S = 0.01
+_MOST_BUGS = 20
+"""Noted of a run: words that hold a number may be new ones in every tick."""
 
 T = TypeVar("T")
 
@@ -77,6 +79,7 @@ class Session:
         self.imus: list[ImuReader] = []
         self.trigger: Trigger | None = None
         self._line_told = False
+        self._n_bugs = 0
         self._t_armed_ns = 0
         self._arm_triplet: ClockTriplet | None = None
         self._trigger_triplet: ClockTriplet | None = None
@@ -229,9 +232,10 @@ class Session:
         self.log.add("first edge", t0_ns=self.t0_ns)
 
     def note_bug(self, words: str) -> bool:
-        """Note that the daemon itself went wrong, and tell whether that is new."""
-        if words in self.missing:
+        """Note that the daemon itself went wrong, and tell whether that is new, and not one of very many."""
+        if words in self.missing or self._n_bugs >= _MOST_BUGS:
             return False
+        self._n_bugs += 1
         self.missing.append(words)
         self.log.add("bug", words=words)
         return True

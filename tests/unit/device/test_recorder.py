@@ -325,6 +325,23 @@ def test_a_bug_in_watching_the_sensors_costs_no_run(
     ]
 
 
+def test_a_bug_whose_words_are_new_each_time_fills_no_memory(
+    bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[int] = []
+
+    def break_down(self: FakeCamera) -> str:
+        looks.append(len(looks))
+        raise KeyError(len(looks))
+
+    monkeypatch.setattr(FakeCamera, "problem", break_down)
+    b = bench()
+    b.arm()
+    wait_until(lambda: len(looks) > 40)
+    assert b.recorder._session is not None
+    assert len(b.recorder._session.missing) == 20
+
+
 def test_a_bug_in_one_part_of_a_run_does_not_cost_the_others(
     bench: Callable[..., Bench], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
