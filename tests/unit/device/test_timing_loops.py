@@ -1,4 +1,5 @@
 import errno
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -8,6 +9,8 @@ from device_fakes import FakeBus, FakeBusOpener, FakeRig
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.imu_records import ImuRecord
 from bricktrack_device.config import DeviceConfig, ImuTable, SamplerTable
+from bricktrack_device.inertial.imu_sampler import sample
+from bricktrack_device.timing import loops
 from bricktrack_device.timing.imu_test import choose_imu, print_report, run_imu_test
 from bricktrack_device.timing.loops import Block, adaptive_loop, naive_loop, plan_blocks, run_block
 from bricktrack_device.timing.result_file import to_json
@@ -29,6 +32,9 @@ class Clock:
 
     def sleep(self, seconds: float) -> None:
         self.now += round(seconds * 1e9) + 60_000  # a wake-up is 60 us late
+
+    def sleep_until(self, due_ns: int) -> None:
+        self.sleep(max(due_ns - self.now, 0) * 1e-9)
 
     def bus(self) -> FakeBus:
         clock = self
@@ -109,13 +115,24 @@ def test_lost_slots_and_repeats_are_counted() -> None:
     )
 
 
-def test_a_block_of_the_grid_has_its_slots_and_ends() -> None:
-    got = run_block(FakeBus(), IMU, "grid", 20)
+@pytest.mark.parametrize(("stop_ns", "slots"), [(0, [*range(20)]), (35_000_000, [*range(8), *range(11, 20)])])
+def test_a_block_of_the_grid_has_its_slots_and_ends(
+    monkeypatch: pytest.MonkeyPatch, stop_ns: int, slots: list[int]
+) -> None:
+    clock = Clock()
+
+    class Stops(FakeBus):
+        def read_burst(self, address: int, register: int, n_bytes: int) -> bytes:
+            clock.now += stop_ns if self.n_bursts == 7 and n_bytes == 46 else 0
+            return super().read_burst(address, register, n_bytes)
+
+    monkeypatch.setattr(loops, "monotonic_ns", clock)
+    monkeypatch.setattr(loops, "sample", partial(sample, clock=clock, sleep_until=clock.sleep_until))
+    got = run_block(Stops(), IMU, "grid", 20)
     assert got.n_slots == 20 and got.t0_ns % PERIOD == 0
-    slots = [r.slot for r in got.records]
-    # A computer that stands still skips slots: the grid goes on, and no record comes before its slot.
-    assert slots == sorted(set(slots)) and slots[-1] >= 19
-    assert all(r.t_before_ns >= got.t0_ns + r.slot * PERIOD for r in got.records)
+    assert [r.slot for r in got.records] == slots
+    # A wake-up is 60 us late, and the grid does not shift when the bus has stood still for 35 ms.
+    assert {r.t_before_ns - got.t0_ns - r.slot * PERIOD for r in got.records} == {60_000}
 
 
 def test_methods_take_turns() -> None:
