@@ -312,13 +312,20 @@ def moving(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
         uv = uv + rng.normal(0, noise, uv.shape)
         track = solve_poses(observed(uv, scene), rays, scene.points, rolling_shutter=rows)
         inner = slice(5, -5)  # the ends know one neighbour only
-        error = (track.t_camera_brick_mm - scene.t)[inner]
-        turn = rvec_from_matrix(np.swapaxes(track.R_camera_brick[inner], -1, -2) @ scene.R[inner])
+        posed = np.arange(n)[inner][np.isfinite(track.t_camera_brick_mm[inner]).all(axis=1)]
+        error = (track.t_camera_brick_mm - scene.t)[posed]
+        turn = rvec_from_matrix(np.swapaxes(track.R_camera_brick[posed], -1, -2) @ scene.R[posed])
         rms = np.sqrt(np.mean(error**2, axis=0))
         deg = np.degrees(np.sqrt(np.mean(np.sum(turn**2, axis=1))))
         whole = np.concatenate([turn, -error], axis=1)
-        nees = np.einsum("ni,nij,nj->n", whole, np.linalg.inv(track.covariance[inner]), whole).mean() / 6
-        print(f"{name:20s} " + "  ".join(f"{x:5.3f}" for x in rms) + f"     {deg:5.3f}   NEES/6 {nees:5.2f}")
+        nees = np.einsum("ni,nij,nj->n", whole, np.linalg.inv(track.covariance[posed]), whole).mean() / 6
+        refused = n - 10 - len(posed)
+        print(
+            f"{name:20s} "
+            + "  ".join(f"{x:5.3f}" for x in rms)
+            + f"     {deg:5.3f}   NEES/6 {nees:5.2f}"
+            + (f"   {refused} of {n - 10} refused" if refused else "")
+        )
 
 
 def timed(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
