@@ -81,7 +81,7 @@ def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
         try:
             msgspec.json.decode(path.read_bytes())
             return
-        except (msgspec.DecodeError, UnicodeDecodeError) as e:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as e:
             logger.warning("%s: not valid JSON: %s; kept as %s", path, e, aside.name)
         store.disk.rename(path, aside)
     if aside.is_file():  # perhaps since a power cut between the two

@@ -218,7 +218,10 @@ def test_recovery_never_overwrites_a_run_and_leaves_strange_folders(tmp_path: Pa
     assert (tmp_path / "runs" / run_id / "manifest.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("damage", [lambda data: bytes(len(data)), lambda data: data[:100], lambda data: b""])
+@pytest.mark.parametrize(
+    "damage",
+    [lambda data: bytes(len(data)), lambda data: data[:100], lambda data: b"", lambda data: b"[" * 9999],
+)
 def test_a_run_whose_manifest_is_damaged_is_taken_up_again(
     tmp_path: Path, damage: Callable[[bytes], bytes]
 ) -> None:
