@@ -9,16 +9,16 @@ from daemon_runs import simulate_run
 from bricktrack_common.brick_model import ProfileEntry
 from bricktrack_host.fusion.estimate import FusionInput, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.led_by_led import led_smoothing
+from bricktrack_host.fusion.led_by_led import led_smoothing, standing_errors
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_smoothing import smooth_leds
-from bricktrack_host.fusion.led_by_led.standing_errors import StandingWay, _likeliest
+from bricktrack_host.fusion.led_by_led.standing_errors import StandingPrior, StandingWay, _likeliest
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.fusion.smoothing.smoother import POS, Filter
 from bricktrack_host.tracking.optical_track import solve_poses
 
 SETTINGS = FusionSettings()
-PROFILE, SIZE, FIRST_LED, BY_VIEW = 21, 22, 23, 37
+PROFILE, SPREAD, FIRST_LED, BY_VIEW = 21, 23, 24, 38
 
 
 def smoothed(run):
@@ -89,6 +89,33 @@ def test_the_derivative_of_the_smoothed_motion_is_that_of_the_filter(plain):
     # Of the largest; each LED moves the state at which the next is linearised.
     assert np.abs(found - shift_m / 0.1).max() < 0.04 * found.max()
     assert found.max() > 1e-6
+
+
+def test_what_acceleration_draws_centroids_by_is_not_told_but_makes_all_unsure(plain, monkeypatch):
+    # Centroids drawn by a tenth less than they are predicted: what that does to the errors estimated.
+    done, last = plain
+    problem, pictured, leds = last.states.problem, last.pictured, done.leds
+    n_views = done.errors.n_views
+    of = last.states.estimate.of
+
+    def errors(drawn, spread_sd):
+        monkeypatch.setattr(standing_errors, "_SPREAD_SD", spread_sd)
+        seen = problem.leds.residual_px - drawn * pictured.accelerated_px
+        moved = replace(problem, leds=problem.leds._replace(residual_px=seen))
+        way = StandingWay(moved, Filter(moved), leds, pictured, 7, of=of, n_views=n_views)
+        prior = StandingPrior.of(leds, pictured, 7, SETTINGS, n_views=n_views, camera_moves=False)
+        return way.estimate(prior, np.zeros_like(done.errors.value))
+
+    sure, unsure, shifted = errors(0.0, 0.0), errors(0.0, 0.4), errors(0.1, 0.0)
+    assert sure.value[SPREAD] == sure.covariance[SPREAD, SPREAD] == shifted.value[SPREAD] == 0.0
+    np.testing.assert_array_equal(unsure.value, sure.value)
+    wrong = (shifted.value - sure.value) / -0.1  # estimate less truth, where they are drawn by as much again
+    wrong[SPREAD] = -1.0
+    more = unsure.covariance - sure.covariance
+    scale = np.sqrt(np.diagonal(unsure.covariance)) + 1e-12
+    off = (more - 0.4**2 * np.outer(wrong, wrong)) / np.outer(scale, scale)
+    assert np.abs(off).max() < 0.01  # each LED moves the state at which the next is linearised
+    assert np.max(np.abs(wrong[:21]) * 0.4 / scale[:21]) > 0.05  # the accelerometer's scale, for one
 
 
 def test_the_likeliest_errors_are_those_of_the_dense_gaussian_formulas():

@@ -89,6 +89,8 @@ class Pictured:
         One standard deviation of what the profile leaves unknown, the same way in all LEDs.
     from_centre_px : ndarray, shape (m, 2)
         The predicted picture less the middle of the sensor's.
+    accelerated_px : ndarray, shape (m, 2)
+        By how much the prediction is the mean over the light's time, and not where the LED is in its middle.
     from_side_rad : ndarray, shape (m, 2)
         How far beside an LED's mean line of sight, along the camera's first two axes, it is seen from.
     facing : ndarray, shape (m,)
@@ -103,6 +105,7 @@ class Pictured:
     J_px: FloatArray
     profile_shift_px: FloatArray
     from_centre_px: FloatArray
+    accelerated_px: FloatArray
     from_side_rad: FloatArray
     facing: FloatArray
     side_on_px: FloatArray
@@ -129,13 +132,15 @@ def picture(
     poses = zip(R_camera_brick, t_camera_brick_mm, strict=True)
     prediction, before, after = (_predict(leds, R, t_mm, ray_model, brick) for R, t_mm in poses)
     mode = ray_model.sensor_mode
+    mean_px = 0.5 * (before.uv_px + after.uv_px)
     return Pictured(
         R_camera_brick=R_camera_brick[0],
         t_camera_brick_mm=t_camera_brick_mm[0],
-        residual_px=leds.uv_px - 0.5 * (before.uv_px + after.uv_px),
+        residual_px=leds.uv_px - mean_px,
         J_px=_by_pose(prediction, leds, R_camera_brick[0], brick),
         profile_shift_px=shift_per_radius(collar_of(brick), brick) * prediction.model_shift_px,
         from_centre_px=prediction.uv_px - 0.5 * np.array([mode.width - 1, mode.height - 1]),
+        accelerated_px=mean_px - prediction.uv_px,
         from_side_rad=_from_side(leds, R_camera_brick[0], t_camera_brick_mm[0], brick),
         facing=prediction.facing,
         side_on_px=prediction.model_shift_px,

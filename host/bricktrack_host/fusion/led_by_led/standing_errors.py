@@ -41,8 +41,8 @@ from bricktrack_host.fusion.smoothing.standing_errors_kernel import Way, carry_b
 from bricktrack_host.tracking.pose.refine import OWN_SHARE
 
 _ARM = slice(18, N_ERRORS)
-_PROFILE, _SCALE = N_ERRORS, N_ERRORS + 1
-_FIRST_LED = N_ERRORS + 2
+_PROFILE, _SCALE, _SPREAD = range(N_ERRORS, N_ERRORS + 3)
+_FIRST_LED = N_ERRORS + 3
 N_VIEWS = 6  # see `_by_view`
 _N_LINEAR = 3
 _CURVED_TELLS = 0.2
@@ -50,6 +50,12 @@ _CURVED_TELLS = 0.2
 _SCALE_SD = 5e-5
 """Of the picture's size: light falls off towards its corners, also across the width of one LED, and draws the
 centroid inwards by some 0.02 px at 400 px from the centre; a lens that warms up does as much."""
+_SPREAD_SD = 0.3
+"""Of how far acceleration draws a moving light's centroid, over what it would were all light weighed alike. A
+pixel that is full counts no more light, and neither rim nor plateau counts all of theirs: in recordings by
+another renderer with 6 to 12 ms of exposure 0.7 to 0.9 of it was left (simulated). The samples do not tell
+it, for their low-pass has the same shape; so it is not estimated, but leaves the motion unsure.
+"""
 _ALIKE_RAD = 0.2
 """Turned by so much, an LED's error is another one. In recordings by another renderer than this project's
 LEDs' errors changed by 5 to 10 times their size per radian (simulated)."""
@@ -64,12 +70,13 @@ _NODES_AT_ONCE = 64  # of the motion's doubt: more are only more memory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandingErrors:
-    """Errors that stand still, in one vector of q = 23 + 2 V L, or 46 + 2 V L where the camera moves.
+    """Errors that stand still, in one vector of q = 24 + 2 V L, or 47 + 2 V L where the camera moves.
 
     In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
-    the profile's, in units of its stated sd; the picture's size over what it should be, less 1; (u, v) of
-    each of L LEDs, px, and V - 1 times as many that change with the view, see `_by_view`; those of the sensor
-    that moves with the camera, as in `CameraErrors.values`.
+    the profile's, in units of its stated sd; the picture's size over what it should be, less 1; how far
+    acceleration draws the centroid, likewise, which is not estimated and stays 0; (u, v) of each of L LEDs,
+    px, and V - 1 times as many that change with the view, see `_by_view`; those of the sensor that moves with
+    the camera, as in `CameraErrors.values`.
 
     Attributes
     ----------
@@ -94,9 +101,8 @@ class StandingErrors:
         """Return what was taken out of a run's sensor already, given where it was said to be."""
         gains = [(gain - np.eye(3)).ravel() for gain in (run.gyro_gain, run.acc_gain)]
         theirs = np.zeros(0) if run.camera is None else run.camera.errors.values()
-        value = np.concatenate(
-            [*gains, run.lever_arm_m - lever_arm_m, np.zeros(2 + 2 * n_views * n_leds), theirs]
-        )
+        of_pictures = np.zeros(_FIRST_LED - N_ERRORS + 2 * n_views * n_leds)
+        value = np.concatenate([*gains, run.lever_arm_m - lever_arm_m, of_pictures, theirs])
         return cls(value, np.zeros((len(value), len(value))), 0.0, n_leds, n_views)
 
     def of_sensor(self, *, since: "StandingErrors") -> SensorErrors:
@@ -114,9 +120,7 @@ class StandingErrors:
             self.n_views, self.n_leds, 2
         )
         own = np.einsum("mk,kmi->mi", _by_view(pictured, self.n_views), of_leds[:, leds.led])
-        common = (
-            self.value[_PROFILE] * pictured.profile_shift_px + self.value[_SCALE] * pictured.from_centre_px
-        )
+        common = _of_all_leds(pictured) @ self.value[_PROFILE:_FIRST_LED]
         return np.asarray(common + own)
 
 
@@ -165,15 +169,19 @@ class StandingPrior:
         return cls(sensor_prior_sd(settings), np.stack(mean[3:], axis=1), shape_px2, camera_sd, n_views)
 
     def covariance(self, offset_sd_px: ArrayLike) -> FloatArray:
-        """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...)."""
+        """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...).
+
+        Without what is not estimated.
+        """
         own = OWN_SHARE * self.led_shift_px
         last_led = _FIRST_LED + own.size
         by_view = slice(last_led, _FIRST_LED + self.n_views * own.size)
         q = by_view.stop + len(self.camera_sd)
         out = np.zeros((*np.shape(offset_sd_px), q, q))
         at = np.arange(q)
+        of_all = [1.0, _SCALE_SD**2, 0.0]
         out[..., at, at] = np.concatenate(
-            [self.sensor_sd**2, [1.0, _SCALE_SD**2], np.zeros(self.n_views * own.size), self.camera_sd**2]
+            [self.sensor_sd**2, of_all, np.zeros(self.n_views * own.size), self.camera_sd**2]
         )
         for led, shift in enumerate(own):
             part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
@@ -241,6 +249,9 @@ class StandingWay:
         believed = prior.covariance(_HIDDEN_SHARE * offset_sd_px)
         _, value = _likeliest(believed, known, normal, pull)
         covariance = np.linalg.solve(np.eye(len(known)) + believed @ normal, believed)
+        # What is not estimated draws the others after it.
+        drawn = np.eye(len(known))[_SPREAD] - covariance @ normal[:, _SPREAD]
+        covariance += _SPREAD_SD**2 * np.outer(drawn, drawn)
         return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px, n_leds, prior.n_views)
 
     def with_doubt(self, estimate: Estimate, errors: StandingErrors) -> Estimate:
@@ -287,6 +298,11 @@ def _by_view(pictured: Pictured, n_views: int) -> FloatArray:
     return np.stack(terms, axis=1)
 
 
+def _of_all_leds(pictured: Pictured) -> FloatArray:
+    """Return what each error that all LEDs share moves their centroids by, shape (m, 2, 3), px."""
+    return np.stack([pictured.profile_shift_px, pictured.from_centre_px, pictured.accelerated_px], axis=2)
+
+
 def _own_part(
     problem: Problem,
     leds: SeenLeds,
@@ -301,7 +317,7 @@ def _own_part(
     m, (n_leds, n_views) = len(leds.t_ns), leds_and_views
     own = np.zeros((m, 2, _FIRST_LED + 2 * n_views * n_leds))
     own[:, :, _ARM] = arrays.J[..., 3:] @ arrays.R_lin
-    own[:, :, _PROFILE], own[:, :, _SCALE] = -pictured.profile_shift_px, -pictured.from_centre_px
+    own[:, :, _PROFILE:_FIRST_LED] = -_of_all_leds(pictured)
     for k, view in enumerate(_by_view(pictured, n_views).T):
         at = _FIRST_LED + 2 * (n_leds * k + leds.led)
         own[np.arange(m), 0, at] = -view
