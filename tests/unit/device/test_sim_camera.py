@@ -1,12 +1,14 @@
 """The simulated camera: stamps, gaps and pictures, decoded again by FFmpeg."""
 
 import threading
+import time
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import av
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from bricktrack_common.camera_model import IMX219_1080P
 from bricktrack_common.clocks import monotonic_ns
@@ -15,6 +17,8 @@ from bricktrack_common.frame_times import mid_exposure_ns
 from bricktrack_common.run_manifest import CameraSection
 from bricktrack_device.config import CameraTable
 from bricktrack_device.interfaces import EncodedPacket, FrameMetadata
+from bricktrack_device.sim import sim_camera
+from bricktrack_device.sim.led_renderer import LedRenderer
 from bricktrack_device.sim.lens import lens_of
 from bricktrack_device.sim.settings import SimFaults, SimSettings
 from bricktrack_device.sim.sim_camera import SimCamera
@@ -134,7 +138,26 @@ def test_every_nth_frame_can_be_dropped() -> None:
     assert gaps[:6].tolist() == [1, 2, 1, 2, 1, 2]
 
 
-def test_a_camera_that_dies_says_nothing_and_stops_anyway() -> None:
+def test_a_picture_that_comes_too_late_is_dropped_and_shows_as_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow_luma(self: LedRenderer, stamp_ns: int) -> NDArray[np.uint8]:
+        time.sleep(0.1)  # three periods, on the quickest computer
+        return dark
+
+    dark = np.full((IMX219_1080P.height, IMX219_1080P.width), 16, dtype=np.uint8)
+    monkeypatch.setattr(LedRenderer, "luma", slow_luma)
+    monkeypatch.setattr(sim_camera, "_MAX_LAG_S", 0.1)
+    sink = Sink(8)
+    camera = SimCamera(SimWorld(SimSettings(clutter=0.0), make_epoch()), CameraTable(iperiod=10))
+    camera.start(sink)
+    assert sink.done.wait(60)
+    camera.stop()
+    periods = np.diff([m.sensor_timestamp_ns for m in sink.metadata]) / PERIOD_NS
+    np.testing.assert_allclose(periods, np.rint(periods), atol=1e-7)
+    n_missing = int(np.rint(periods - 1).sum())
+    assert 3 <= n_missing <= camera.frames_dropped
+
+
+def test_a_camera_that_dies_gives_what_it_had_and_stops() -> None:
     settings = SimSettings(clutter=0.0, faults=SimFaults(camera_dies_after_s=0.3))
     _, sink, _, camera = film(settings, 100)
     assert len(sink.packets) == 9  # 0.3 s are 9.0 periods

@@ -2,18 +2,18 @@
 
 import multiprocessing
 import pickle
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 import pytest
+from other_world import tell_first_edge_and_place
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from bricktrack_common.arrays import FloatArray
 from bricktrack_common.errors import ConfigError
 from bricktrack_device.sim.settings import HiddenLed, SimSettings
-from bricktrack_device.sim.world import Epoch, SimWorld, angular_rate_and_acceleration, make_epoch
+from bricktrack_device.sim.world import SimWorld, angular_rate_and_acceleration, make_epoch
 
 ARMED_NS = 5_000_000_000_000
 SETTINGS = SimSettings(motion="sines", amplitude_deg=15.0, shake_delay_s=1.0, quiet_s=0.5, shake_s=6.0)
@@ -162,11 +162,6 @@ def test_edges_have_the_laboratory_s_period_on_the_unit_s_clock() -> None:
     assert edges[-1] - edges[0] == pytest.approx(20_000_800_000, abs=2)
 
 
-def _first_edge_and_pose(settings: SimSettings, epoch: Epoch, answer: Connection) -> None:
-    world = SimWorld(settings, epoch)
-    answer.send((world.first_edge_ns, world.pose(np.array([FIRST_NS + 2_345_678_901]))[1].tolist()))
-
-
 @pytest.mark.slow
 def test_another_process_lives_in_the_same_world() -> None:
     context = multiprocessing.get_context("spawn")
@@ -174,13 +169,14 @@ def test_another_process_lives_in_the_same_world() -> None:
     world = SimWorld(SETTINGS, epoch)
     world.schedule(ARMED_NS)
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_first_edge_and_pose, args=(SETTINGS, epoch, theirs))
+    t_ns = FIRST_NS + 2_345_678_901
+    process = context.Process(target=tell_first_edge_and_place, args=(SETTINGS, epoch, t_ns, theirs))
     process.start()
     theirs.close()
     found = ours.recv()  # an end of file where the process ends without an answer
     process.join()
     ours.close()
-    assert found == (FIRST_NS, world.pose(np.array([FIRST_NS + 2_345_678_901]))[1].tolist())
+    assert found == (FIRST_NS, world.pose(np.array([t_ns]))[1].tolist())
 
 
 def test_settings_pass_between_processes() -> None:
