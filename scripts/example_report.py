@@ -263,6 +263,7 @@ def example_result(seed: int = 1) -> RunResult:
         edge_index=numbers,
         edge_fit=edge_fit,
         imu=imu,
+        imu_camera_t_ns=imu.t_ns - 210_000,
         rest=tare(optical, imu),
         alignment={
             "method": "frame rotations against the integrated gyroscope",

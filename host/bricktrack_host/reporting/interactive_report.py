@@ -38,7 +38,7 @@ from bricktrack_host.reporting.report import recording_date
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.results.run_summary import (
     KeyFigures,
-    imu_minus_camera_ns,
+    imu_camera_time_ns,
     key_figures,
     main_kind,
     main_track,
@@ -220,7 +220,7 @@ def _inertial(result: RunResult, panels: TimePanels) -> list[tuple[PlotSection, 
     if imu is None or not len(imu.t_ns):
         return []
     axis = TimeAxis.of(result)
-    t_s = axis.s(imu.t_ns - imu_minus_camera_ns(result))
+    t_s = axis.s(imu_camera_time_ns(result))
     force = samples(t_s, {f"y{i}": imu.acc_mps2[:, i] for i in range(3)})
     rates = compare_rates(result)
     if rates is None:

@@ -21,7 +21,7 @@ from bricktrack_host.reporting.plots import (
 from bricktrack_host.reporting.rate_comparison import compare_rates
 from bricktrack_host.reporting.thinning import thinned_band
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.results.run_summary import KeyFigures, imu_minus_camera_ns
+from bricktrack_host.results.run_summary import KeyFigures, imu_camera_time_ns
 from bricktrack_host.results.truth import COMPONENTS, TruthComparison
 
 
@@ -167,7 +167,7 @@ def inertial_chart(result: RunResult, figures: KeyFigures) -> Chart | None:
     if imu is None or not len(imu.t_ns):
         return None
     axis = TimeAxis.of(result)
-    t_s = axis.s(imu.t_ns - imu_minus_camera_ns(result))
+    t_s = axis.s(imu_camera_time_ns(result))
     chart = panel_grid(3, 2, height_in=4.6, legend=True)
     for k, (what, values, unit) in enumerate(
         (("force", imu.acc_mps2, "m/s²"), ("rate", np.rad2deg(imu.gyro_radps), "deg/s"))

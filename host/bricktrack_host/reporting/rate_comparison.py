@@ -8,7 +8,7 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.reporting.plots import TimeAxis
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.results.run_summary import imu_minus_camera_ns
+from bricktrack_host.results.run_summary import imu_camera_time_ns
 
 _MIN_SAMPLES = 10
 
@@ -49,7 +49,7 @@ def compare_rates(result: RunResult) -> RateComparison | None:
     turn = rvec_from_matrix(np.swapaxes(R[:-1], -1, -2) @ R[1:])
     optical_dps = np.rad2deg(turn / step_s[:, None])
     optical_dps[step_s >= 2.5 * np.median(step_s)] = np.nan
-    gyro_s = axis.s(imu.t_ns[usable] - imu_minus_camera_ns(result))
+    gyro_s = axis.s(imu_camera_time_ns(result)[usable])
     gyro_dps = np.rad2deg(imu.gyro_radps[usable])
     bounds_s = np.stack([axis.s(t_ns[:-1]), axis.s(t_ns[1:])], axis=1)
     mean_dps = _means_over(gyro_s, gyro_dps, bounds_s)

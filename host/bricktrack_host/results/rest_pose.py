@@ -126,7 +126,6 @@ def tare(
     imu: ImuTrack | None = None,
     *,
     interval_ns: tuple[int, int] | None = None,
-    imu_minus_camera_ns: int = 0,
 ) -> RestPose:
     """Return the robust mean pose over the quiet interval before the shake.
 
@@ -138,11 +137,9 @@ def tare(
     ----------
     optical : OpticalTrack
     imu : ImuTrack, optional
-        Sees the beginning of the shake earlier than the camera.
+        Stamped on the camera's time. Sees the beginning of the shake earlier than the camera.
     interval_ns : (int, int), optional
         First and last instant to use, CLOCK_MONOTONIC of the unit.
-    imu_minus_camera_ns : int, ns
-        Stamp of an inertial sample less the camera's stamp of the same instant.
 
     Raises
     ------
@@ -162,7 +159,7 @@ def tare(
         return _mean_pose(optical, np.flatnonzero(chosen), "given")
     frames = _first_still_frames(optical, valid)
     if imu is not None and frames.size:
-        onset_ns = _inertial_onset_ns(imu, imu_minus_camera_ns, optical.t_ns[frames])
+        onset_ns = _inertial_onset_ns(imu, optical.t_ns[frames])
         if onset_ns is not None:
             frames = frames[optical.t_ns[frames] < onset_ns]
     if frames.size < MIN_FRAMES:
@@ -206,10 +203,9 @@ def _first_still_frames(optical: OpticalTrack, valid: BoolArray) -> IntArray:
     return np.empty(0, dtype=np.int64)
 
 
-def _inertial_onset_ns(imu: ImuTrack, imu_minus_camera_ns: int, frames_ns: IntArray) -> int | None:
-    """Return when the inertial sensor begins to move within the span of the frames, camera's time."""
-    t_ns = imu.t_ns - imu_minus_camera_ns
-    span = (t_ns <= frames_ns[-1]) & np.isfinite(imu.gyro_radps).all(axis=1)
+def _inertial_onset_ns(imu: ImuTrack, frames_ns: IntArray) -> int | None:
+    """Return when the inertial sensor begins to move within the span of the frames."""
+    span = (imu.t_ns <= frames_ns[-1]) & np.isfinite(imu.gyro_radps).all(axis=1)
     span &= np.isfinite(imu.acc_mps2).all(axis=1)
     inside = np.flatnonzero(span)
     # The noise is that of the first half of what can be rest.
@@ -223,8 +219,8 @@ def _inertial_onset_ns(imu: ImuTrack, imu_minus_camera_ns: int, frames_ns: IntAr
         moving |= (np.abs(values[inside] - centre) > np.maximum(floor, _N_SD * sd)).any(axis=1)
     in_a_row = np.convolve(moving, np.ones(_N_IN_A_ROW), "valid") == _N_IN_A_ROW
     begins = inside[np.flatnonzero(in_a_row)]
-    begins = begins[t_ns[begins] >= frames_ns[0]]
-    return int(t_ns[begins[0]]) if begins.size else None
+    begins = begins[imu.t_ns[begins] >= frames_ns[0]]
+    return int(imu.t_ns[begins[0]]) if begins.size else None
 
 
 def _mean_pose(optical: OpticalTrack, frames: IntArray, source: Literal["found", "given"]) -> RestPose:

@@ -34,7 +34,12 @@ from bricktrack_host.results.result_tables import (
 )
 from bricktrack_host.results.table_columns import CONVENTIONS
 from bricktrack_host.results.table_files import read_table, write_table
-from bricktrack_host.results.tables_to_tracks import fused_from_table, imu_from_table, optical_from_tables
+from bricktrack_host.results.tables_to_tracks import (
+    fused_from_table,
+    imu_camera_times,
+    imu_from_table,
+    optical_from_tables,
+)
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
 RESULTS_SCHEMA = "bricktrack.results"
@@ -88,6 +93,8 @@ class RunResult:
     edge_fit : EdgeFit or None
     imu : ImuTrack or None
         The samples that the fusion used, brick axes.
+    imu_camera_t_ns : ndarray of int64, shape (n,), or None
+        When each of those samples was taken, on the camera's time; `None` where the clocks were not aligned.
     rest : RestPose or None
         `None`: nothing was quiet; displacements from rest are NaN.
     alignment : dict
@@ -114,6 +121,7 @@ class RunResult:
     problems: tuple[str, ...]
     provenance: Provenance
     timings_s: dict[str, float] = field(default_factory=dict)
+    imu_camera_t_ns: IntArray | None = None
 
     @property
     def t0_ns(self) -> int | None:
@@ -246,7 +254,7 @@ def _write_files(result: RunResult, folder: Path) -> None:
         ),
     }
     if result.imu is not None:
-        tables["imu"] = imu_table(result.imu, t0_ns=t0_ns, metadata=metadata)
+        tables["imu"] = imu_table(result.imu, result.imu_camera_t_ns, t0_ns=t0_ns, metadata=metadata)
     if result.edge_fit is not None:
         tables["edges"] = edges_table(result.edge_fit, t0_ns=t0_ns, metadata=metadata)
     for name, table in tables.items():
@@ -297,8 +305,9 @@ def read_result(folder: Path) -> RunResult:
             raise RunFormatError(f"{folder / SUMMARY_NAME}: tables: no '{name}'")
     optical, observations = optical_from_tables(tables["optical"], tables["leds"], len(summary.led_names))
     fused, edge_index = fused_from_table(tables["fused"])
-    imu = None
+    imu = imu_camera_t_ns = None
     if "imu" in tables:
+        imu_camera_t_ns = imu_camera_times(tables["imu"])
         imu = imu_from_table(
             tables["imu"], np.nan if summary.acc_range_mps2 is None else summary.acc_range_mps2
         )
@@ -316,6 +325,7 @@ def read_result(folder: Path) -> RunResult:
         edge_index=edge_index,
         edge_fit=edge_fit,
         imu=imu,
+        imu_camera_t_ns=imu_camera_t_ns,
         rest=rest_pose_of(summary.rest_pose),
         alignment=summary.alignment,
         calibration=summary.calibration,

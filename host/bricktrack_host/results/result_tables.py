@@ -152,10 +152,20 @@ def leds_table(
     return make_table(columns, metadata)
 
 
-def imu_table(imu: ImuTrack, *, t0_ns: int | None, metadata: dict[str, str]) -> "pa.Table":
-    """Return the table of inertial samples in brick axes, as the fusion used them."""
+def imu_table(
+    imu: ImuTrack, camera_t_ns: IntArray | None, *, t0_ns: int | None, metadata: dict[str, str]
+) -> "pa.Table":
+    """Return the table of inertial samples in brick axes, as the fusion used them.
+
+    ``camera_t_ns``, shape (n,), ns: when each was taken, on the camera's time; `None` if that is not known.
+    """
+    taken: Columns = []
+    if camera_t_ns is not None:
+        column = Column("camera_t_ns", "ns", "when the sample was taken, on the camera's time")
+        taken.append((column, pa.array(camera_t_ns)))
     columns: Columns = [
         *_time_columns(imu.t_ns, t0_ns, None)[:2],
+        *taken,
         *vector_columns("acc_{}_mps2", "m/s^2", "specific force in brick axes", imu.acc_mps2),
         *vector_columns("gyro_{}_radps", "rad/s", "angular rate in brick axes, with bias", imu.gyro_radps),
         (Column("flags", "bits", "ImuFlag bits"), pa.array(imu.flags)),

@@ -71,10 +71,11 @@ def main_track(result: RunResult) -> FusedTrack | None:
     return None if kind is None else result.fused[kind]
 
 
-def imu_minus_camera_ns(result: RunResult) -> int:
-    """Return what the alignment found between the stamps of the inertial sensor and the camera's."""
-    offset_ms = result.alignment.get("imu_minus_camera_ms", result.alignment.get("offset_ms", 0.0))
-    return round(float(offset_ms) * 1e6) if isinstance(offset_ms, (int, float)) else 0
+def imu_camera_time_ns(result: RunResult) -> IntArray:
+    """Return when the inertial samples were taken, on the camera's time; their stamps where that is all."""
+    if result.imu is None:
+        return np.empty(0, dtype=np.int64)
+    return result.imu.t_ns if result.imu_camera_t_ns is None else result.imu_camera_t_ns
 
 
 def key_figures(result: RunResult) -> KeyFigures:

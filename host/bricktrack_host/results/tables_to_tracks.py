@@ -82,6 +82,11 @@ def imu_from_table(table: "pa.Table", acc_range_mps2: float) -> ImuTrack:
     )
 
 
+def imu_camera_times(table: "pa.Table") -> IntArray | None:
+    """Return when the samples of `imu_table` were taken, on the camera's time; `None` if it does not say."""
+    return _ints(table, "camera_t_ns") if "camera_t_ns" in table.column_names else None
+
+
 def _column(table: "pa.Table", name: str) -> Any:
     if name not in table.column_names:
         raise RunFormatError(f"results table without the column '{name}'; was it written by bricktrack?")

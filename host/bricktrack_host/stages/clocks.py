@@ -224,10 +224,11 @@ def unsure_stamps(
 
 def rest_pose(optical: OpticalTrack, inertial: Inertial | None, problems: list[str]) -> RestPose | None:
     """Return the pose before the shaking began, or `None` and why."""
-    offset_ns = 0 if inertial is None else round(inertial.alignment.offset_ns)
-    imu = None if inertial is None else inertial.imu
+    imu = None
+    if inertial is not None:
+        imu = replace(inertial.imu, t_ns=inertial.alignment.camera_time_ns(inertial.imu))
     try:
-        return tare(optical, imu, imu_minus_camera_ns=offset_ns)
+        return tare(optical, imu)
     except TrackingError as e:
         problems.append(f"no rest pose, so no displacements from rest: {e}")
         return None

@@ -14,13 +14,12 @@ from bricktrack_common.run_folder import Run
 from bricktrack_host.assemblies.motion_history import HistoryError, run_history
 from bricktrack_host.quality import PoseFlag, describe
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.results.run_summary import key_figures, main_track, verdict
+from bricktrack_host.results.run_summary import imu_camera_time_ns, key_figures, main_track, verdict
 from bricktrack_host.viewing.run_scene import (
     Body,
     Many,
     brick_at,
     encoded_pictures,
-    imu_camera_time_ns,
     led_marks,
     led_rays,
     measured,

@@ -18,7 +18,6 @@ from bricktrack_common.run_folder import Run
 from bricktrack_host.assemblies.motion_history import NOT_MEASURED
 from bricktrack_host.recordings.annex_b import NAL_PPS, NAL_SPS, iter_nal_units
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.results.run_summary import imu_minus_camera_ns
 
 AXIS_MM = 20.0
 _BOX_MARGIN_MM = 6.0
@@ -211,13 +210,6 @@ def nearest_pinhole(rays: RayModel) -> Pinhole:
     fx, fy = 2 * step / (slope[1, 0] - slope[2, 0]), 2 * step / (slope[3, 1] - slope[4, 1])
     centre = middle - np.array([fx, fy]) * slope[0]
     return Pinhole((float(fx), float(fy)), (float(centre[0]), float(centre[1])))
-
-
-def imu_camera_time_ns(result: RunResult) -> IntArray:
-    """Return the instants of the inertial samples on the camera's time, by the alignment that was found."""
-    if result.imu is None:
-        return np.empty(0, dtype=np.int64)
-    return np.asarray(result.imu.t_ns - imu_minus_camera_ns(result))
 
 
 def encoded_pictures(video: Path, frames: FrameTimes) -> list[bytes]:

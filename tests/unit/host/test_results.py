@@ -94,6 +94,7 @@ def test_everything_comes_back(result, folder):
     np.testing.assert_array_equal(result.optical.led_t_ns, back.optical.led_t_ns)
     np.testing.assert_array_equal(result.edge_index, back.edge_index)
     np.testing.assert_array_equal(result.imu.gyro_radps, back.imu.gyro_radps)
+    np.testing.assert_array_equal(result.imu_camera_t_ns, back.imu_camera_t_ns)
     np.testing.assert_array_equal(result.rest.R_camera_rest, back.rest.R_camera_rest)
     for name in ("factor", "slopes"):
         np.testing.assert_array_equal(
@@ -192,6 +193,7 @@ def test_a_run_without_fusion_rest_trigger_or_edges_is_written_and_read(result, 
     write_results(bare, tmp_path / "results")
     back = read_result(tmp_path / "results")
     assert back.fused == {}
+    assert back.imu is None and back.imu_camera_t_ns is None
     assert back.rest is None
     assert back.edge_fit is None
     table = pq.read_table(tmp_path / "results" / "optical.parquet").to_pydict()

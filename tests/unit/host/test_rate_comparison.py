@@ -1,0 +1,29 @@
+"""Gyroscope and optics beside each other stand at the instants of the samples, not of their reads."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bricktrack_host.reporting.rate_comparison import compare_rates
+
+READ_LATE_NS = 15_000_000  # so late that it shows beside the noise of single poses
+
+
+@pytest.fixture(scope="module")
+def result():
+    source = Path(__file__).resolve().parents[3] / "scripts" / "example_report.py"
+    spec = importlib.util.spec_from_file_location("example_report", source)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.example_result()
+
+
+def test_late_reads_leave_no_difference_between_the_rates(result):
+    late = replace(result, imu=replace(result.imu, t_ns=result.imu.t_ns + READ_LATE_NS))
+    as_taken, as_read = compare_rates(late), compare_rates(replace(late, imu_camera_t_ns=None))
+    assert np.array_equal(as_taken.gyro_s, compare_rates(result).gyro_s)
+    assert np.nanstd(as_read.difference_dps) > 1.5 * np.nanstd(as_taken.difference_dps)
