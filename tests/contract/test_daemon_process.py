@@ -43,6 +43,8 @@ class Process:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "bricktrack_device.cli", "run", "--backend", "sim", "--config", config,
              "--storage", folder / "storage", "--port", "0", "--unit", "unit-7"],
+            # These tests may run under nohup, and a daemon that does outlives its terminal.
+            preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
             start_new_session=True, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         self.log: list[str] = []
