@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -83,6 +84,7 @@ def main() -> int:
             print(f"         {name:28s} {tally}")
     identities(args.searches, args.seed, brick, camera)
     moving(args.seed, brick, camera)
+    moving_with_few(args.seed, brick, camera)
     timed(args.seed, brick, camera)
     return 0
 
@@ -281,34 +283,44 @@ def observed(uv: FloatArray, scene: Scene, step_ns: int = 33_327_000) -> LedObse
     )
 
 
+class Swing:
+    """A brick swinging at up to 0.3 m/s and some 2 degrees, whose LEDs are seen as their rows are read out."""
+
+    def __init__(self, brick: BrickModel, camera: TrueCamera, n: int) -> None:
+        self.brick, self.camera = brick, camera
+        self.frame_s = np.arange(n) * 33.327e-3
+
+    def pose(self, t_s: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
+        """Return the pose at instants; 4 Hz, 12 mm: 0.3 m/s along x and half of it along y and z."""
+        places_mm = self.brick.led_positions_mm
+        middle = 0.5 * (places_mm.min(axis=0) + places_mm.max(axis=0))
+        angle = 2 * np.pi * 4.0 * t_s
+        wave = np.stack([np.sin(angle), 0.5 * np.sin(angle + 1), 0.5 * np.sin(angle + 2)], axis=-1)
+        R = matrix_from_rvec(np.radians(2.0) * share * wave[..., [1, 2, 0]])
+        return R, np.array([0.0, 0.0, 134.0]) + 12.0 * share * wave - R @ middle
+
+    def pixels(self, share: float) -> FloatArray:
+        """Return where the LEDs are seen: a fixed point of row and instant, which a few rounds settle."""
+        mode = self.camera.mode
+        led_s = np.repeat(self.frame_s[:, None], self.brick.n_leds, axis=1)
+        for _ in range(20):
+            R, t = self.pose(led_s, share)
+            uv = self.camera.project(np.einsum("nlij,lj->nli", R, self.brick.led_positions_mm) + t)
+            led_s = self.frame_s[:, None] + (uv[..., 1] - 0.5 * (mode.height - 1)) * mode.line_time_ns * 1e-9
+        return uv
+
+
 def moving(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
     """Print errors of a brick swinging at 0.3 m/s, read out in 20 ms: row times taken, and not."""
     rng = np.random.default_rng([seed, 9])
     noise, n = 0.05, 900
     rays = camera.calibrated(noise_px=noise, rng=rng)
-    mode = camera.mode
-    frame_s = np.arange(n) * 33.327e-3
-    middle = 0.5 * (brick.led_positions_mm.min(axis=0) + brick.led_positions_mm.max(axis=0))
-    omega = 2 * np.pi * 4.0  # 4 Hz, 12 mm: 0.3 m/s along x and half of it along y and z
-
-    def pose(t_s: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
-        wave = np.stack(
-            [np.sin(omega * t_s), 0.5 * np.sin(omega * t_s + 1), 0.5 * np.sin(omega * t_s + 2)], axis=-1
-        )
-        R = matrix_from_rvec(np.radians(2.0) * share * wave[..., [1, 2, 0]])
-        return R, np.array([0.0, 0.0, 134.0]) + 12.0 * share * wave - R @ middle
-
+    swing = Swing(brick, camera, n)
     print("\nMoving at up to 0.3 m/s, 4 Hz, 20 ms read-out, 0.05 px: root mean square errors")
     print("                       x      y      z mm    deg")
     for name, share, rows in (("at rest", 0.0, True), ("row times", 1.0, True), ("one instant", 1.0, False)):
-        at_frame = pose(frame_s, share)
-        scene = Scene(*at_frame, brick, camera, noise)
-        # Each LED is seen when its own row is: a fixed point, a few rounds settle it.
-        led_s = np.repeat(frame_s[:, None], brick.n_leds, axis=1)
-        for _ in range(20):
-            R, t = pose(led_s, share)
-            uv = camera.project(np.einsum("nlij,lj->nli", R, brick.led_positions_mm) + t)
-            led_s = frame_s[:, None] + (uv[..., 1] - 0.5 * (mode.height - 1)) * mode.line_time_ns * 1e-9
+        scene = Scene(*swing.pose(swing.frame_s, share), brick, camera, noise)
+        uv = swing.pixels(share)
         uv = uv + rng.normal(0, noise, uv.shape)
         track = solve_poses(observed(uv, scene), rays, scene.points, rolling_shutter=rows)
         inner = slice(5, -5)  # the ends know one neighbour only
@@ -326,6 +338,33 @@ def moving(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
             + f"     {deg:5.3f}   NEES/6 {nees:5.2f}"
             + (f"   {refused} of {n - 10} refused" if refused else "")
         )
+
+
+def moving_with_few(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
+    """Print how often poses of a swinging brick with few LEDs are wrong and sure, or refused."""
+    rng = np.random.default_rng([seed, 10])
+    noise, n = 0.05, 60
+    rays = camera.calibrated(noise_px=noise, rng=rng)
+    swing = Swing(brick, camera, n)
+    print("\nThe same, each choice of LEDs in its turn the only ones seen, of 60 frames")
+    print("                    frames   off by a degree and 4 sd   refused")
+    for n_leds in (6, 5, 4):
+        n_frames = n_wrong = n_refused = 0
+        for leds in combinations(range(brick.n_leds), n_leds):
+            places_mm = brick.led_positions_mm[list(leds)]
+            if np.linalg.matrix_rank(places_mm - places_mm[0], tol=0.1) < 2:
+                continue  # a column has no pose
+            scene = Scene(*swing.pose(swing.frame_s, 1.0), brick, camera, noise)
+            uv = swing.pixels(1.0) + rng.normal(0, noise, (n, brick.n_leds, 2))
+            uv[:, [k for k in range(brick.n_leds) if k not in leds]] = np.nan
+            track = solve_poses(observed(uv, scene), rays, scene.points)
+            posed = np.isfinite(track.t_camera_brick_mm).all(axis=1)
+            R, sd = track.R_camera_brick[posed], track.covariance[posed, :3, :3]
+            turn = np.linalg.norm(rvec_from_matrix(np.swapaxes(R, -1, -2) @ scene.R[posed]), axis=1)
+            sure = 4 * np.sqrt(np.einsum("nii->n", sd))
+            n_frames, n_refused = n_frames + n, n_refused + int((~posed).sum())
+            n_wrong += int((turn > np.maximum(sure, np.radians(1.0))).sum())
+        print(f"{n_leds} LEDs           {n_frames:10d} {n_wrong:26d} {n_refused:9d}", flush=True)
 
 
 def timed(seed: int, brick: BrickModel, camera: TrueCamera) -> None:
