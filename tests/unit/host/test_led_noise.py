@@ -10,6 +10,7 @@ from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_noise import (
     STATED_SCALES,
     InertialNoise,
+    believed_covariance_px2,
     centroid_scales,
     still_sightings,
 )
@@ -29,7 +30,28 @@ def sightings(frame, led, u_px):
 def test_a_picture_stands_still_where_it_was_a_frame_before():
     #                 first   stays  another LED  moves  a frame is missing
     leds = sightings([4, 5, 5, 6, 8], [1, 1, 2, 1, 1], [700.0, 700.2, 700.2, 702.0, 702.0])
-    assert still_sightings(leds).tolist() == [False, True, False, False, False]
+    assert still_sightings(leds).tolist() == [True, True, False, False, False]
+
+
+def test_the_first_picture_stands_still_where_the_next_one_is_in_its_place():
+    #                 starts: moves  stops  stays         comes late, stays
+    leds = sightings([0, 1, 2, 3, 2, 3], [1, 1, 1, 1, 3, 3], [700.0, 710.0, 720.0, 720.1, 900.0, 900.0])
+    assert still_sightings(leds).tolist() == [False, False, False, True, True, True]
+
+
+def test_a_picture_that_moves_is_no_surer_than_one_at_rest():
+    leds = sightings([0, 1, 2, 3], [1, 1, 1, 1], [700.0, 700.1, 710.0, 740.0])
+    leds.cov_px2[2:] = np.diag([0.01, 0.002]), np.diag([0.4, 0.05])  # stated: the more, the longer the smear
+    still = still_sightings(leds)
+    found = believed_covariance_px2(leds, still, np.array([0.2, 0.5]))
+    np.testing.assert_allclose(found[:2], np.tile(0.25e-3 * np.eye(2), (2, 1, 1)), rtol=1e-12)
+    # 0.2^2 of what is stated, and of the 0.5^2 at rest what 0.2^2 leaves out.
+    np.testing.assert_allclose(found[2], np.diag([0.0004 + 0.00021, 0.00008 + 0.00021]), rtol=1e-12)
+    np.testing.assert_allclose(found[3], np.diag([0.016 + 0.00021, 0.002 + 0.00021]), rtol=1e-12)
+    # Surer at rest, as where errors repeat: nothing is added to those that move.
+    found = believed_covariance_px2(leds, still, np.array([0.8, 0.3]))
+    np.testing.assert_allclose(found[3], 0.64 * leds.cov_px2[3], rtol=1e-12)
+    np.testing.assert_allclose(found[0], 0.09 * leds.cov_px2[0], rtol=1e-12)
 
 
 def chi2_of(scale, n, rng):

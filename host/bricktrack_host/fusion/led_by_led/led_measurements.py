@@ -186,14 +186,14 @@ def led_arrays(
     lin: Linearisation,
     levels: tuple[NoiseLevel, NoiseLevel],
     *,
-    scale: FloatArray,
+    cov_px2: FloatArray,
     use: BoolArray,
     settings: FusionSettings,
 ) -> LedArrays:
     """Return the smoother's measurements of one run: each LED tied to the node nearest in time.
 
-    ``scale``, shape (m,), multiplies the stated sd of the centroids; ``use`` says which are shown to the
-    filter. What the inertial samples leave unsure between node and LED is added to the covariance.
+    ``cov_px2``, shape (m, 2, 2), is believed of the centroids; ``use`` says which are shown to the filter.
+    What the inertial samples leave unsure between node and LED is added to the covariance.
     """
     t_cam_s = seconds_since(leds.t_ns, run.signal.epoch_ns)
     t_s = run.imu_time_s(t_cam_s, lin)
@@ -221,7 +221,7 @@ def led_arrays(
     turn = parts.gyro(levels[0]) * np.abs(dt)
     shift = parts.acc(levels[1]) * np.abs(dt) ** 3 / 3
     between = np.repeat(np.stack([turn, shift], axis=1), 3, axis=1)
-    cov = scale[:, None, None] ** 2 * leds.cov_px2 + np.einsum("mik,mk,mjk->mij", J, between, J)
+    cov = cov_px2 + np.einsum("mik,mk,mjk->mij", J, between, J)
     first = np.searchsorted(node, np.arange(len(nodes.t_s) + 1))[:, None].astype(np.int64)
     return LedArrays(
         first=first,

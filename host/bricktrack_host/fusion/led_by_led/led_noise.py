@@ -34,14 +34,30 @@ def still_sightings(leds: SeenLeds) -> BoolArray:
     """Return which LEDs are seen where they were a frame before, shape (m,).
 
     There mosaic, pixel grid and codec make the same error again, and the noise is that of the light alone.
+    An LED that no frame before shows stands where it does not move to the next one.
     """
     order = np.lexsort((leds.frame, leds.led))
     frame, led, uv = leds.frame[order], leds.led[order], leds.uv_px[order]
-    again = (np.diff(led) == 0) & (np.diff(frame) == 1)
-    again &= np.linalg.norm(np.diff(uv, axis=0), axis=1) < _STILL_PX
+    follows = (np.diff(led) == 0) & (np.diff(frame) == 1)
+    again = follows & (np.linalg.norm(np.diff(uv, axis=0), axis=1) < _STILL_PX)
     still = np.zeros(len(frame), dtype=np.bool_)
     still[order[1:]] = again
+    still[order[:-1]] |= again & ~np.append(False, follows[:-1])
     return still
+
+
+def believed_covariance_px2(leds: SeenLeds, still: BoolArray, scales: FloatArray) -> FloatArray:
+    """Return the covariance of centroids whose stated sd is off by ``scales``, shape (m, 2, 2).
+
+    What is stated of a picture that moves is mostly its smear, and may be several times too much. What a
+    picture at rest is unsure by, one that moves slowly is unsure by as well.
+    """
+    cov_px2 = np.square(scales[still.astype(np.int64)])[:, None, None] * leds.cov_px2
+    if still.any():
+        at_rest_px2 = np.median(0.5 * np.trace(leds.cov_px2[still], axis1=1, axis2=2))
+        more_px2 = max(scales[1] ** 2 - scales[0] ** 2, 0.0) * at_rest_px2
+        cov_px2[~still] += more_px2 * np.eye(2)
+    return np.asarray(cov_px2)
 
 
 def centroid_scales(chi2: FloatArray, still: BoolArray, use: BoolArray, scale: FloatArray) -> FloatArray:

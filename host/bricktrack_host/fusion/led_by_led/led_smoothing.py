@@ -18,6 +18,7 @@ from bricktrack_host.fusion.led_by_led.led_measurements import (
 )
 from bricktrack_host.fusion.led_by_led.led_noise import (
     STATED_SCALES,
+    believed_covariance_px2,
     centroid_scales,
     choose_inertial_noise,
     still_sightings,
@@ -211,7 +212,7 @@ def _prepared(sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, b
     )  # fmt: skip
     arrays = led_arrays(
         leds, pictured, run, nodes, lin, belief.levels,
-        scale=belief.scales[sights.still.astype(np.int64)], use=use, settings=settings,
+        cov_px2=believed_covariance_px2(leds, sights.still, belief.scales), use=use, settings=settings,
     )  # fmt: skip
     return _Ready(pictured, use, run, nodes, lin, replace(problem, leds=arrays))
 
