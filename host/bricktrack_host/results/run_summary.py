@@ -72,10 +72,17 @@ def main_track(result: RunResult) -> FusedTrack | None:
 
 
 def imu_camera_time_ns(result: RunResult) -> IntArray:
-    """Return when the inertial samples were taken, on the camera's time; their stamps where that is all."""
+    """Return when the inertial samples were taken, on the camera's time.
+
+    Older results do not say it: by the offset between both clocks, if one was found.
+    """
     if result.imu is None:
         return np.empty(0, dtype=np.int64)
-    return result.imu.t_ns if result.imu_camera_t_ns is None else result.imu_camera_t_ns
+    if result.imu_camera_t_ns is not None:
+        return result.imu_camera_t_ns
+    offset_ms = result.alignment.get("offset_ms")
+    offset_ns = round(offset_ms * 1e6) if isinstance(offset_ms, int | float) else 0
+    return np.asarray(result.imu.t_ns - offset_ns)
 
 
 def key_figures(result: RunResult) -> KeyFigures:
