@@ -13,7 +13,7 @@ from bricktrack_common.arrays import FloatArray
 
 _SD_PER_RADIUS = 0.008
 """Of the shift of the light's middle over radius times sine: as far as limb darkening and lens put it beside
-that of the shape (simulated; see `brick_model.DEFAULT_SHIFT_SD_PER_RADIUS`). A run does not tell how much it is:
+that of the shape (simulated; see `brick_model.DEFAULT_SHIFT_SD_PER_RADIUS`). A run hardly tells how much:
 in 14 simulated recordings what LEDs say among themselves was 0.4 to 5 times as likely by it as without."""
 _ALIKE_RAD = 0.5
 """LEDs seen at angles so far apart show different parts of their shape."""
