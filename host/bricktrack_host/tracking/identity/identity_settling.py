@@ -103,9 +103,14 @@ def _settle_rounds(run: RunIdentities) -> FloatArray:
             verified = verified.replaced(bad[fits], again.take(np.flatnonzero(fits)))
             good[bad[fits]] = True
         bad = np.flatnonzero(~good)
-        if bad.size:  # what a card leaves of an LED lies where no pose has it: the others count
+        if bad.size:  # what a card leaves of an LED lies where no pose has it: the others count, if they
+            # are many or turn as their neighbours do
             again = _verify_known(run, frames[bad], lights.take(bad), motion, usual_gate, intruders=True)
-            fits = (again.kept.sum(axis=1) >= _ENOUGH_OTHERS) & (scatter_px(again) <= tight[bad])
+            turn, between = run.turns()
+            is_calm = turn_between(_attitudes(again), between[frames[bad]]) <= _usual_turn(turn)[frames[bad]]
+            n_kept = again.kept.sum(axis=1)
+            agree = (n_kept >= _ENOUGH_OTHERS) | (n_kept >= MIN_INLIERS) & is_calm
+            fits = agree & (scatter_px(again) <= tight[bad])
             verified = verified.replaced(bad[fits], again.take(np.flatnonzero(fits)))
             good[bad[fits]] = True
         run.take(frames, assigned, verified, good)
