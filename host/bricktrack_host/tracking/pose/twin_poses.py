@@ -11,6 +11,7 @@ import numpy as np
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.first_poses import RIVAL_CHI2, SAME_POSE_RAD, believe_neighbours
 from bricktrack_host.tracking.pose.refine import MIN_LEDS, RefinedPoses
@@ -90,8 +91,8 @@ def _is_rival(own: RefinedPoses, twins: RefinedPoses, uv_px: FloatArray) -> Bool
     rows = np.flatnonzero(out)
     turn = rvec_from_matrix(np.swapaxes(own.R_camera_brick[rows], 1, 2) @ twins.R_camera_brick[rows])
     of_attitude = own.covariance[rows, :3, :3] * scale[rows, None, None]
-    sigmas2 = np.einsum("ni,ni->n", turn, np.linalg.solve(of_attitude, turn[..., None])[..., 0])
-    out[rows] = (np.linalg.norm(turn, axis=1) > SAME_POSE_RAD) & (sigmas2 > _COVERED_SIGMAS**2)
+    is_covered = normalised_squares(turn, of_attitude) <= _COVERED_SIGMAS**2  # not where that is singular
+    out[rows] = (np.linalg.norm(turn, axis=1) > SAME_POSE_RAD) & ~is_covered
     return out
 
 
