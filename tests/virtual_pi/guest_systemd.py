@@ -95,6 +95,14 @@ class Manager:
         told = "\n".join(line for line in kernel if "bricktrackd" in line)
         return f"{done.stdout}{done.stderr}\n{told}"
 
+    def log_once_it_says(self, words: str, timeout_s: float = 60.0) -> str:
+        """Return the journal when it holds certain words: it lags behind what happens."""
+        deadline = time.monotonic() + timeout_s
+        while words not in (log := self.log()):
+            assert time.monotonic() < deadline, f"no {words!r} in the journal\n{log}"
+            time.sleep(0.25)
+        return log
+
     def wait_for(self, name: str, value: str, timeout_s: float = 60.0) -> None:
         deadline = time.monotonic() + timeout_s
         while (now := self.show(name)) != value:
@@ -133,7 +141,7 @@ def manager():
 
 def test_it_is_ready_once_the_self_test_has_told_what_works(manager):
     assert (manager.show("ActiveState"), manager.show("SubState")) == ("active", "running")
-    log = manager.log()
+    log = manager.log_once_it_says("Started")
     failed = [line for line in log.splitlines() if "health: self-test" in line]
     assert len(failed) == 1 and "self-test: camera" in failed[0] and "picamera2" in failed[0], log
     ready = next(i for i, line in enumerate(log.splitlines()) if "Started" in line)

@@ -32,8 +32,10 @@ def test_a_run_is_found_by_its_folder_or_its_results(lab, run):
     assert analysis.load_run(str(lab / "b7-1" / "results")).run_id == run.run_id == "b7-1_0001_shake"
     assert run.simulated
     assert "2 frames were dropped by the camera" in run.problems
-    with pytest.raises(RunFormatError, match="Process the run first"):
+    with pytest.raises(RunFormatError, match="Name one of them"):
         analysis.load_run(lab)
+    with pytest.raises(RunFormatError, match="Process the run first"):
+        analysis.load_run(lab / "b7-1" / "nowhere")
 
 
 def test_motion_at_edges_is_that_of_the_table(run):
