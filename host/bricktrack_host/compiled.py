@@ -120,7 +120,7 @@ def _one_at_a_time(compile_for: Callable[[Any], Any], folder: Path, name: str) -
 @cache
 def _say_once() -> None:
     logger.warning(
-        "compiling the numerical loops for this machine, about a minute in all; kept in %s, so only once",
+        "compiling the numerical loops for this machine, some minutes in all; kept in %s, so only once",
         COMPILED_ROOT,
     )
 

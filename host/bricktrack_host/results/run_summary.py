@@ -192,7 +192,7 @@ def _flag_problems(result: RunResult, figures: KeyFigures) -> list[str]:
     if n := count(PoseFlag.UNCOVERED):
         found.append(f"{n} poses use rays where the calibration had no dots and extrapolates")
     if n := count(PoseFlag.AMBIGUOUS):
-        found.append(f"in {n} frames more than one pose fitted; none is given there")
+        found.append(f"in {n} frame{'' if n == 1 else 's'} more than one pose fitted; none is given there")
     if n := count(PoseFlag.UNVERIFIED):
         found.append(f"in {n} frame{'' if n == 1 else 's'} too few LEDs were seen to check which is which")
     track = main_track(result)
