@@ -226,7 +226,7 @@ def rest_pose(optical: OpticalTrack, inertial: Inertial | None, problems: list[s
     """Return the pose before the shaking began, or `None` and why."""
     imu = None
     if inertial is not None:
-        imu = replace(inertial.imu, t_ns=inertial.alignment.camera_time_ns(inertial.imu))
+        imu = replace(inertial.imu, t_ns=inertial.alignment.sampled_ns(inertial.imu))
     try:
         return tare(optical, imu)
     except TrackingError as e:

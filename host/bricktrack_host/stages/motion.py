@@ -50,10 +50,7 @@ def output_grid(optical: OpticalTrack, inertial: Inertial | None, edge_fit: Edge
     first, last = int(optical.t_ns[0]), int(optical.t_ns[-1])
     t_ns: dict[FusedKind, IntArray] = {}
     if inertial is not None:
-        imu, alignment = inertial.imu, inertial.alignment
-        # The stamps are IMU time; the offset's own change over it (skew x offset) is below a nanosecond.
-        shift_ns = alignment.imu_time_ns(imu.t_ns) - imu.t_ns
-        slots = imu.t_ns - shift_ns
+        slots = inertial.alignment.camera_time_ns(inertial.imu.t_ns)
         t_ns["imu"] = slots[(slots >= first) & (slots <= last)]
     t_ns["frame"] = optical.t_ns
     index = np.empty(0, dtype=np.int64)

@@ -142,7 +142,7 @@ def solve_run(
         edge_index=grid.edge_index,
         edge_fit=edge_fit,
         imu=imu,
-        imu_camera_t_ns=None if inertial is None else inertial.alignment.camera_time_ns(inertial.imu),
+        imu_camera_t_ns=None if inertial is None else inertial.alignment.sampled_ns(inertial.imu),
         rest=rest,
         alignment=alignment_details(inertial, fusion, optical),
         calibration=calibration_details(calibration),

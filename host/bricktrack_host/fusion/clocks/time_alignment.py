@@ -89,11 +89,15 @@ class TimeAlignment:
         shift = self.offset_ns + self.skew * (t_ns - self.t_mid_ns).astype(np.float64)
         return np.asarray(t_ns + np.round(shift).astype(np.int64))
 
-    def camera_time_ns(self, imu: ImuTrack) -> IntArray:
+    def camera_time_ns(self, t_ns: IntArray) -> IntArray:
+        """Return camera time of instants given in the IMU's time."""
+        since_ns = (t_ns - self.t_mid_ns).astype(np.float64) - self.offset_ns
+        return np.asarray(self.t_mid_ns + np.round(since_ns / (1 + self.skew)).astype(np.int64))
+
+    def sampled_ns(self, imu: ImuTrack) -> IntArray:
         """Return when each sample was taken, in camera time: a read finds a sample that may be a slot old."""
         sampled = imu if self.sample_clock is None else self.sample_clock.restamp(imu)
-        since_ns = (sampled.t_ns - self.t_mid_ns).astype(np.float64) - self.offset_ns
-        return np.asarray(self.t_mid_ns + np.round(since_ns / (1 + self.skew)).astype(np.int64))
+        return self.camera_time_ns(sampled.t_ns)
 
 
 def has_pose(optical: OpticalTrack) -> BoolArray:
