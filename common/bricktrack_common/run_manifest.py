@@ -31,6 +31,10 @@ FILE_NAME_PATTERN = r"^[a-z0-9][a-z0-9_.-]{0,63}$"
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
+class NewerRunError(RunFormatError):
+    """A run folder of a newer version than this bricktrack reads: nothing is wrong with it."""
+
+
 class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of the manifest's sections: frozen, by keyword, and strict about unknown keys."""
 
@@ -163,7 +167,8 @@ def read_manifest(path: Path) -> RunManifest:
     Raises
     ------
     RunFormatError
-        If there is none, it is no manifest, is of a newer version, or a key is missing or wrong.
+        If there is none, it is no manifest, or a key is missing or wrong; `NewerRunError` if it is of a newer
+        version.
     """
     try:
         data = path.read_bytes()
@@ -196,7 +201,7 @@ def parse_manifest(data: bytes, *, where: str) -> RunManifest:
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise RunFormatError(f"{where}: version {version!r}; expected a positive integer")
     if version > MANIFEST_VERSION:
-        raise RunFormatError(
+        raise NewerRunError(
             f"{where}: {MANIFEST_SCHEMA} version {version}; this bricktrack reads up to version "
             f"{MANIFEST_VERSION}. Upgrade bricktrack on this machine"
         )

@@ -1,4 +1,7 @@
-"""What a power cut left: whole runs are finished, cut ones get a manifest of what is there; nothing goes."""
+"""What a power cut or a bad card left: whole runs are finished, others get a manifest of what is there.
+
+Nothing goes: what cannot be read is kept under another name.
+"""
 
 import logging
 import re
@@ -19,11 +22,13 @@ from bricktrack_common.run_manifest import (
     MANIFEST_NAME,
     VIDEO_NAME,
     ClocksSection,
+    NewerRunError,
     QualitySection,
     RunManifest,
     TriggerSection,
     file_entry,
     is_run_id,
+    parse_manifest,
     read_manifest,
 )
 from bricktrack_common.typed_data import dump_json
@@ -74,18 +79,24 @@ def recover_runs(store: RunStore) -> list[str]:
 
 
 def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
-    """Take up a run again whose manifest is no JSON any more; one of a newer version is left alone."""
+    """Take up a run again whose manifest is lost, or none any more; one of a newer version is left alone."""
     path = folder / MANIFEST_NAME
-    aside = path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX)
     if path.is_file():
         try:
-            msgspec.json.decode(path.read_bytes())
+            parse_manifest(path.read_bytes(), where=str(path))
             return
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as e:
-            logger.warning("%s: not valid JSON: %s; kept as %s", path, e, aside.name)
+        except NewerRunError as e:
+            logger.warning("%s", e)
+            return
+        except (RunFormatError, RecursionError) as e:
+            aside = path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX)
+            logger.warning("%s; kept as %s", e, aside.name)
         store.disk.rename(path, aside)
-    if aside.is_file():  # perhaps since a power cut between the two
-        store.disk.rename(folder, folder.with_name(folder.name + PARTIAL_SUFFIX))
+    elif not folder.is_dir() or not any(_is_run_file(p) for p in folder.iterdir()):
+        logger.warning("%s: holds nothing of a run; left alone", folder)
+        return
+    # Without a manifest perhaps since a power cut between the two renamings.
+    store.disk.rename(folder, folder.with_name(folder.name + PARTIAL_SUFFIX))
 
 
 def _finish(partial: Path, run_id: str, store: RunStore) -> None:
@@ -95,7 +106,6 @@ def _finish(partial: Path, run_id: str, store: RunStore) -> None:
         manifest = msgspec.structs.replace(manifest, files=entries)
         store.disk.write_file(partial / MANIFEST_NAME, lambda f: f.write(dump_json(manifest)))
         store.disk.sync_folder(partial)
-    (partial / DRAFT_NAME).unlink(missing_ok=True)
     store.disk.rename(partial, store.runs / run_id)
 
 
@@ -120,7 +130,9 @@ def rebuild_manifest(folder: Path, run_id: str, unit: str) -> RunManifest:
     must do, and the manifest says so. A stream that cannot be read is renamed, so that it stands in nobody's
     way and is still there.
     """
-    missing = ["saving was cut off before it was done; what had reached the card is here"]
+    missing = [
+        "no whole manifest was on the card: saving was cut off, or the card lost it; what is there is here"
+    ]
     imus: list[ImuDescription] = []
     t0_ns: int | None = None
     for path in sorted(folder.glob("imu_*.msgpack")):

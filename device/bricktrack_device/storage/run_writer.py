@@ -1,7 +1,8 @@
 """Writing one run folder, file after file: what was written stays, and a failed save can be taken up again.
 
 The folder is ``<id>.partial`` until the manifest, written last, stands in it with the hash of every file;
-then it is renamed.
+then it is renamed. The draft, the manifest as it was known first, stays: should the card damage the one, the
+other still says how the run was recorded.
 """
 
 from collections.abc import Callable
@@ -79,7 +80,6 @@ class RunWriter:
                 self._disk.sync_folder(self._final.parent)
                 return self._final
             self._disk.write_file(path, lambda f: f.write(dump_json(manifest)))
-            (self.folder / DRAFT_NAME).unlink(missing_ok=True)
             self._disk.sync_folder(self.folder)
             self._disk.rename(self.folder, self._final)
         except OSError as e:

@@ -14,7 +14,13 @@ from bricktrack_common.errors import StorageError
 from bricktrack_common.frame_times import FrameRecord
 from bricktrack_common.imu_records import ImuDescription, ImuRecord
 from bricktrack_common.run_folder import read_run
-from bricktrack_common.run_manifest import CameraSection, ClocksSection, RunManifest, WaveSection
+from bricktrack_common.run_manifest import (
+    CameraSection,
+    ClocksSection,
+    RunManifest,
+    WaveSection,
+    read_manifest,
+)
 from bricktrack_device.capture.recording import ImuRecording, Recording, RunLog, save
 from bricktrack_device.capture.ring import VideoCut
 from bricktrack_device.capture.trigger import EdgeTrain
@@ -132,8 +138,7 @@ def test_a_saved_run_reads_back_verified(tmp_path: Path) -> None:
     assert run.edges_ns.tolist() == [T0, T0 + 20_000_000]
     assert (run.video or tmp_path).read_bytes() == b"".join(bytes([i]) * 100 for i in range(N_FRAMES))
     names = {p.name for p in (tmp_path / "runs" / run_id).iterdir()}
-    assert names == {"manifest.json"} | {f.name for f in run.manifest.files}
-    assert DRAFT_NAME not in names
+    assert names == {"manifest.json", DRAFT_NAME} | {f.name for f in run.manifest.files}
 
 
 def test_numbers_go_on_over_restarts_and_a_lost_counter(tmp_path: Path) -> None:
@@ -198,6 +203,7 @@ def test_recovery_without_the_draft_takes_what_the_streams_say(tmp_path: Path) -
     final = tmp_path / "runs" / run_id
     partial = final.rename(final.with_name(run_id + ".partial"))
     (partial / "manifest.json").unlink()
+    (partial / DRAFT_NAME).unlink()
     (partial / "Weird Name").write_text("left alone")
     assert recover_runs(store_in(tmp_path)) == [run_id]
     run = read_run(final, verify_hashes=True)
@@ -220,23 +226,47 @@ def test_recovery_never_overwrites_a_run_and_leaves_strange_folders(tmp_path: Pa
 
 @pytest.mark.parametrize(
     "damage",
-    [lambda data: bytes(len(data)), lambda data: data[:100], lambda data: b"", lambda data: b"[" * 9999],
+    [
+        lambda data: bytes(len(data)),
+        lambda data: data[:100],
+        lambda data: b"",
+        lambda data: b"[" * 9999,
+        lambda data: data.replace(b'"window_ns"', b'"vindow_ns"'),
+        lambda data: data.replace(b'"bricktrack.run"', b'"bricktrack.rwn"'),
+    ],
 )
-def test_a_run_whose_manifest_is_damaged_is_taken_up_again(
+def test_a_run_whose_manifest_is_damaged_is_made_anew_from_its_draft(
     tmp_path: Path, damage: Callable[[bytes], bytes]
 ) -> None:
     store = store_in(tmp_path)
     run_id, other = save_one(store), save_one(store)
     path = tmp_path / "runs" / run_id / "manifest.json"
+    before = read_manifest(path)
     path.write_bytes(damage(path.read_bytes()))
     newer = tmp_path / "runs" / other / "manifest.json"
     newer.write_text('{"schema": "bricktrack.run", "version": 99}')
     assert recover_runs(store_in(tmp_path)) == [run_id]
-    run = read_run(path.parent, verify_hashes=True)
-    assert run.manifest.state == "interrupted" and run.manifest.trigger.t0_ns == T0
-    assert run.video is not None and run.video.stat().st_size == 100 * N_FRAMES
+    m = read_run(path.parent, verify_hashes=True).manifest
+    assert m.state == "interrupted" and (m.camera, m.clocks) == (before.camera, before.clocks)
+    assert (m.window_ns, m.trigger, m.quality) == (before.window_ns, before.trigger, before.quality)
+    assert set(before.files) < set(m.files)
     assert path.with_name("manifest.json.damaged").exists()
     assert newer.read_text().endswith("99}")  # a newer bricktrack reads it
+
+
+def test_a_run_whose_manifest_is_lost_is_taken_up_again_and_no_other_folder(tmp_path: Path) -> None:
+    run_id = save_one(store_in(tmp_path))
+    (tmp_path / "runs" / run_id / "manifest.json").unlink()
+    (tmp_path / "runs" / "notes").mkdir()
+    (tmp_path / "runs" / "notes" / "README").write_text("of somebody")
+    store = store_in(tmp_path)
+    assert store.list_runs() == []  # nothing to offer as long as nobody has looked
+    assert recover_runs(store) == [run_id]
+    assert [(r.run_id, r.state) for r in store.list_runs()] == [(run_id, "interrupted")]
+    run = read_run(tmp_path / "runs" / run_id, verify_hashes=True)
+    assert run.manifest.camera is not None and run.video is not None
+    assert (tmp_path / "runs" / "notes" / "README").exists()
+    assert recover_runs(store_in(tmp_path)) == []
 
 
 def test_a_power_cut_while_a_damaged_run_is_taken_up_again_does_not_lose_it(tmp_path: Path) -> None:
@@ -310,7 +340,7 @@ def test_listing_is_oldest_first_and_leaves_partial_and_broken_folders_out(tmp_p
     (tmp_path / "runs" / "empty").mkdir()
     listed = store.list_runs()
     assert [r.run_id for r in listed] == ids
-    on_disk = sum(p.stat().st_size for p in (tmp_path / "runs" / ids[0]).iterdir())
+    on_disk = sum(p.stat().st_size for p in (tmp_path / "runs" / ids[0]).iterdir() if p.name != DRAFT_NAME)
     assert listed[0].n_bytes == on_disk and not listed[0].confirmed
 
 
