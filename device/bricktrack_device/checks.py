@@ -4,7 +4,7 @@ import socket
 from collections.abc import Callable
 
 from bricktrack_common.errors import HardwareError
-from bricktrack_device.capture.recording import software_versions
+from bricktrack_device.capture.saving import software_versions
 from bricktrack_device.config import DeviceConfig, ImuTable
 from bricktrack_device.health import machine, storage
 from bricktrack_device.health.camera import check_camera

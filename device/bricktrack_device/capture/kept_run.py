@@ -1,7 +1,8 @@
 """A recording from the moment it was made until it is on the card: nothing in between may lose it."""
 
 from bricktrack_common.errors import StorageError
-from bricktrack_device.capture.recording import Recording, save
+from bricktrack_device.capture.recording import Recording
+from bricktrack_device.capture.saving import save
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import RunWriter

@@ -1,0 +1,124 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from saved_runs import BOOT, T0, CutDisk, PowerCut, save_one, store_in
+
+from bricktrack_common.run_folder import read_run
+from bricktrack_common.run_manifest import (
+    RunManifest,
+    read_manifest,
+)
+from bricktrack_device.storage import recovery
+from bricktrack_device.storage.recovery import recover_runs
+from bricktrack_device.storage.run_store import RunStore
+from bricktrack_device.storage.run_writer import DRAFT_NAME
+
+
+def test_recovery_without_the_draft_takes_what_the_streams_say(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    run_id = save_one(store)
+    final = tmp_path / "runs" / run_id
+    partial = final.rename(final.with_name(run_id + ".partial"))
+    (partial / "manifest.json").unlink()
+    (partial / DRAFT_NAME).unlink()
+    (partial / "Weird Name").write_text("left alone")
+    assert recover_runs(store_in(tmp_path)) == [run_id]
+    run = read_run(final, verify_hashes=True)
+    assert run.manifest.state == "interrupted" and run.manifest.trigger.t0_ns == T0
+    assert list(run.imus) == ["brick"] and run.manifest.camera is None
+    assert any("description was lost" in words for words in run.manifest.missing)
+    assert (final / "Weird Name").exists()
+
+
+def test_recovery_never_overwrites_a_run_and_leaves_strange_folders(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    run_id = save_one(store)
+    before = (tmp_path / "runs" / run_id / "manifest.json").read_bytes()
+    (tmp_path / "runs" / f"{run_id}.partial").mkdir()
+    (tmp_path / "runs" / "-odd-.partial").mkdir()
+    assert recover_runs(store_in(tmp_path)) == []
+    assert (tmp_path / "runs" / f"{run_id}.partial").is_dir()
+    assert (tmp_path / "runs" / run_id / "manifest.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: bytes(len(data)),
+        lambda data: data[:100],
+        lambda data: b"",
+        lambda data: b"[" * 9999,
+        lambda data: data.replace(b'"window_ns"', b'"vindow_ns"'),
+        lambda data: data.replace(b'"bricktrack.run"', b'"bricktrack.rwn"'),
+    ],
+)
+def test_a_run_whose_manifest_is_damaged_is_made_anew_from_its_draft(
+    tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    store = store_in(tmp_path)
+    run_id, other = save_one(store), save_one(store)
+    path = tmp_path / "runs" / run_id / "manifest.json"
+    before = read_manifest(path)
+    path.write_bytes(damage(path.read_bytes()))
+    newer = tmp_path / "runs" / other / "manifest.json"
+    newer.write_text('{"schema": "bricktrack.run", "version": 99}')
+    assert recover_runs(store_in(tmp_path)) == [run_id]
+    m = read_run(path.parent, verify_hashes=True).manifest
+    assert m.state == "interrupted" and (m.camera, m.clocks) == (before.camera, before.clocks)
+    assert (m.window_ns, m.trigger, m.quality) == (before.window_ns, before.trigger, before.quality)
+    assert set(before.files) < set(m.files)
+    assert path.with_name("manifest.json.damaged").exists()
+    assert newer.read_text().endswith("99}")  # a newer bricktrack reads it
+
+
+def test_a_run_whose_manifest_is_lost_is_taken_up_again_and_no_other_folder(tmp_path: Path) -> None:
+    run_id = save_one(store_in(tmp_path))
+    (tmp_path / "runs" / run_id / "manifest.json").unlink()
+    (tmp_path / "runs" / "notes").mkdir()
+    (tmp_path / "runs" / "notes" / "README").write_text("of somebody")
+    store = store_in(tmp_path)
+    assert store.list_runs() == []  # nothing to offer as long as nobody has looked
+    assert recover_runs(store) == [run_id]
+    assert [(r.run_id, r.state) for r in store.list_runs()] == [(run_id, "interrupted")]
+    run = read_run(tmp_path / "runs" / run_id, verify_hashes=True)
+    assert run.manifest.camera is not None and run.video is not None
+    assert (tmp_path / "runs" / "notes" / "README").exists()
+    assert recover_runs(store_in(tmp_path)) == []
+
+
+def test_a_power_cut_while_a_damaged_run_is_taken_up_again_does_not_lose_it(tmp_path: Path) -> None:
+    cut_at, was_cut = 0, True
+    while was_cut:
+        cut_at += 1
+        folder = tmp_path / str(cut_at)
+        run_id = save_one(store_in(folder))
+        (folder / "runs" / run_id / "manifest.json").write_bytes(b"")
+        try:
+            recover_runs(RunStore(folder, "unit-1", disk=CutDisk(cut_at), boot_id=BOOT))
+            was_cut = False
+        except PowerCut:
+            recover_runs(store_in(folder))
+        run = read_run(folder / "runs" / run_id, verify_hashes=True)
+        assert run.manifest.trigger.t0_ns == T0 and run.video is not None
+    assert cut_at > 4  # two names, the new manifest, and its name
+
+
+def test_a_bug_in_a_recovery_leaves_the_folder_alone_and_the_unit_comes_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_in(tmp_path)
+    folders = [tmp_path / "runs" / save_one(store) for _ in range(2)]
+    for folder in folders:
+        (folder / "manifest.json").unlink()
+        folder.rename(folder.with_name(folder.name + ".partial"))
+
+    def break_down(folder: Path, run_id: str, unit: str) -> RunManifest:
+        if run_id == folders[0].name:
+            raise ZeroDivisionError("a bug")
+        return rebuild(folder, run_id, unit)
+
+    rebuild = recovery.rebuild_manifest
+    monkeypatch.setattr(recovery, "rebuild_manifest", break_down)
+    assert recover_runs(store_in(tmp_path)) == [folders[1].name]
+    assert folders[0].with_name(folders[0].name + ".partial").is_dir()
