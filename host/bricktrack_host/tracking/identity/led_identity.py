@@ -197,10 +197,15 @@ def _verified(
     if suspect.size == 0:
         return verified
     start = (verified.poses.R_camera_brick[suspect], verified.poses.t_camera_brick_mm[suspect])
-    return verified.replaced(
-        suspect,
-        run.verify(lights.take(suspect), start, intruders=True, n_lights=run.lights.count[frames[suspect]]),
-    )
+    return verified.replaced(suspect, _without_intruders(run, lights.take(suspect), start, frames[suspect]))
+
+
+def _without_intruders(
+    run: RunIdentities, lights: LedLights, starts: tuple[FloatArray, FloatArray], frames: IntArray
+) -> Verified:
+    """Verify assignments of frames among whose lights may be a false one, however the brick moves in them."""
+    unknown = unknown_motion(lights.uv_px, run.ray_model)
+    return run.verify(lights, starts, intruders=True, motion=unknown, n_lights=run.lights.count[frames])
 
 
 def _grow(run: RunIdentities) -> int:
@@ -228,15 +233,7 @@ def _grow(run: RunIdentities) -> int:
         verified = _verified(run, lights, *start, frames)
         bad = np.flatnonzero(~(verified.poses.chi2 <= _BELIEVED_CHI2))
         if bad.size:  # a false light may be among them
-            some = lights.take(bad)
-            unknown = unknown_motion(some.uv_px, run.ray_model)
-            again = run.verify(
-                some,
-                (start[0][bad], start[1][bad]),
-                intruders=True,
-                motion=unknown,
-                n_lights=run.lights.count[frames[bad]],
-            )
+            again = _without_intruders(run, lights.take(bad), (start[0][bad], start[1][bad]), frames[bad])
             verified = verified.replaced(bad, again)
         n_kept = np.where(verified.poses.chi2 <= _BELIEVED_CHI2, verified.kept.sum(axis=1), 0)
         order = np.lexsort((-n_kept, frames))
