@@ -2,7 +2,7 @@ import numpy as np
 
 from bricktrack_host.tracking.identity import led_identity
 
-from .test_identity_newcomers import BRICK, CAMERA, COLLAR, N, STEP_NS, known_run
+from .test_identity_newcomers import BRICK, CAMERA, COLLAR, STEP_NS, N, known_run
 
 
 def test_an_impact_within_a_frame_costs_no_search_from_nothing(monkeypatch):
