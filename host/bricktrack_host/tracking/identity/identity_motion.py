@@ -11,11 +11,13 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
-from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
+from bricktrack_common.rotations import matrix_from_rvec
+from bricktrack_host.tracking.identity.neighbour_kernel import fill_between
 from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.frame_motion import UNKNOWN_TWIST_SD, motion_to_leds
 from bricktrack_host.tracking.pose.refine import LedMotion
+from bricktrack_host.tracking.pose.turn_kernel import angles_between
 
 _MAX_FILLED = 2
 """Frames without a pose, one after the other, that their neighbours' spline bridges."""
@@ -116,34 +118,12 @@ def poses_between(stamps_ns: IntArray, R: FloatArray, t_mm: FloatArray) -> tuple
     R, t_mm : ndarray, shapes (n, 3, 3) and (n, 3)
         NaN where there is no pose.
     """
-    n = len(R)
-    out_R, out_t = np.full_like(R, np.nan), np.full_like(t_mm, np.nan)
+    out_R, out_t = np.full(R.shape, np.nan), np.full(t_mm.shape, np.nan)
     valid = np.flatnonzero(all_finite(R, 2) & all_finite(t_mm))
-    i = np.arange(n)
-    before = np.searchsorted(valid, i)
-    after = np.searchsorted(valid, i, side="right")
-    i = np.flatnonzero((before >= 2) & (after + 2 <= valid.size))
-    if i.size == 0:
-        return out_R, out_t
-    near = valid[np.stack([before[i] - 2, before[i] - 1, after[i], after[i] + 1], axis=1)]
-    close = (near[:, 2] - near[:, 1] <= _MAX_FILLED + 1) & (near[:, 3] - near[:, 0] <= _MAX_FILLED + 5)
-    i, near = i[close], near[close]
-    s = (stamps_ns[near] - stamps_ns[i][:, None]) * 1e-9
-    weight = np.ones(s.shape)  # Lagrange's, at zero
-    for k in range(4):
-        for other in range(4):
-            if other != k:
-                weight[:, k] *= -s[:, other] / (s[:, k] - s[:, other])
-    first = R[near[:, 1]]
-    turns = rvec_from_matrix(np.swapaxes(first, -1, -2)[:, None] @ R[near])
-    out_R[i] = first @ matrix_from_rvec(np.einsum("nk,nki->ni", weight, turns))
-    out_t[i] = np.einsum("nk,nki->ni", weight, t_mm[near])
+    fill_between(stamps_ns, valid, R, t_mm, _MAX_FILLED, out_R, out_t)
     return out_R, out_t
 
 
 def turn_between(R: FloatArray, other: FloatArray) -> FloatArray:
     """Return the angle between attitudes (n, 3, 3), rad; NaN where one is not known."""
-    out = np.full(len(R), np.nan)
-    both = all_finite(R, 2) & all_finite(other, 2)
-    out[both] = np.linalg.norm(rvec_from_matrix(np.swapaxes(R[both], -1, -2) @ other[both]), axis=1)
-    return out
+    return angles_between(np.ascontiguousarray(R), np.ascontiguousarray(other))

@@ -4,7 +4,6 @@ By splines through the poses of neighbouring frames, or by a fused motion; both 
 """
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
@@ -14,13 +13,11 @@ from bricktrack_host.tracking.led_model.led_profile import collar_of, predict_br
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.first_poses import FirstPoses
 from bricktrack_host.tracking.pose.refine import LedMotion, RefinedPoses
-from bricktrack_host.tracking.pose.turn_kernel import turns_between
+from bricktrack_host.tracking.pose.spline_kernel import carried_by_spline, poses_as_vectors, spline_doubt
 from bricktrack_host.tracks import FusedTrack, LedObservations
 
 _MAX_GAP_PERIODS = 3.5  # wider gaps end a spline: a shaken brick turns back within them
-_SPLINE_SHARE = 0.1
 _FEWEST_FRAMES = 9  # of which five fourth differences are had: fewer may all be small by chance
-_SHAKE_RADPS = 54.0  # 8.6 Hz: the highest frequency of a shake that 30 frames a second follow
 _TWIST_FLOOR = np.array([0.005, 0.3])  # rad/s, mm/s: far below what moves a centroid within a frame
 _FUSED_TWIST_SD = np.repeat([0.03, 5.0], 3)  # rad/s, mm/s: of the fused motion between frames
 UNKNOWN_TWIST_SD = np.array([1.0, 1.0, 1.0, 300.0, 300.0, 300.0])
@@ -102,14 +99,13 @@ def motion_to_leds(
         for part in np.split(valid, np.flatnonzero(np.diff(seconds[valid]) > _MAX_GAP_PERIODS * period) + 1):
             if part.size < 2:
                 continue
-            R0 = R_camera_brick[part[part.size // 2]]
-            turns = rvec_from_matrix(R0.T @ R_camera_brick[part])
-            samples = np.hstack([turns, t_camera_brick_mm[part]])
-            spline = CubicSpline(seconds[part], samples)
-            here, there = spline(seconds[part]), spline(led_seconds[part])
-            rvec[part] = turns_between(here[:, :3], there[..., :3])
-            shift[part] = there[..., 3:] - here[:, None, 3:]
-            twist_sd[part], jump_sd[part] = _spline_doubt(samples, seconds[part])
+            samples = poses_as_vectors(R_camera_brick[part], t_camera_brick_mm[part])
+            turns, shifts = np.empty((2, part.size, n_leds, 3))
+            carried_by_spline(samples, seconds[part], led_seconds[part], turns, shifts)
+            rvec[part], shift[part] = turns, shifts
+            if part.size >= _FEWEST_FRAMES:
+                limits = _TWIST_FLOOR, UNKNOWN_TWIST_SD[[0, 3]]
+                twist_sd[part], jump_sd[part] = spline_doubt(samples, seconds[part], *limits)
     return LedMotion(
         rvec_brick_rad=rvec,
         shift_camera_mm=shift,
@@ -177,31 +173,3 @@ def motion_doubt_px2(
     )
     by_jump = J * (motion.dt_s[frames][..., None] * jump_sd[:, None])[:, :, None, :]
     return np.asarray(by_jump @ np.swapaxes(by_jump, -1, -2))
-
-
-def _spline_doubt(samples: FloatArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how wrong a cubic spline's velocity may be at each frame, and how far it may jump there.
-
-    Both have shape (n, 6), rad/s and mm/s. For a sine of w T = 1.8 (8.6 Hz at 30 frames a second) the
-    velocity is 8.5 % off, which is 0.026 of the fourth difference over T; at lower frequencies less, at an
-    impact several times that. Where frames are missing, such a sine turns back unseen between two of them:
-    then it is all of w times the amplitude that may be wrong, and the largest of five fourth differences is
-    about twenty amplitudes. Ends know one side only.
-    """
-    n, apart_s = len(samples), np.diff(t_s)
-    if n < _FEWEST_FRAMES:
-        unknown = np.tile(UNKNOWN_TWIST_SD, (n, 1))
-        return unknown, unknown
-    fourth = np.diff(samples, 4, axis=0)
-    size = np.stack([np.linalg.norm(fourth[:, :3], axis=1), np.linalg.norm(fourth[:, 3:], axis=1)], axis=1)
-    # Of a frame those five that it is in; of frames near an end those nearest to it.
-    near = np.max([size[k : k + n - 8] for k in range(5)], axis=0)
-    local = _SPLINE_SHARE * np.pad(near, ((4, 4), (0, 0)), mode="edge")
-    local[[0, 1, -2, -1]] *= 3.0
-    is_unseen = np.pad(_SHAKE_RADPS * apart_s > np.pi, 2, mode="edge")
-    is_near_unseen = np.any([is_unseen[k : k + n] for k in range(4)], axis=0)
-    jump = local / np.median(apart_s)
-    velocity = np.where(is_near_unseen[:, None], np.maximum(jump, 0.5 * _SHAKE_RADPS * local), jump)
-    least, most = _TWIST_FLOOR, UNKNOWN_TWIST_SD[[0, 3]]
-    velocity, jump = (np.repeat(np.clip(sd, least, most), 3, axis=1) for sd in (velocity, jump))
-    return velocity, jump
