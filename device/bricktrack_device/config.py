@@ -38,10 +38,13 @@ class StorageTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=True
     """``[storage]``: where runs are kept, and how many bytes must stay free beside a run.
 
     With ``delete_confirmed`` the oldest runs that a host has confirmed are deleted when the card is too full
-    to arm; otherwise none is, but by a host's command.
+    to arm; otherwise none is, but by a host's command. ``black_box`` is a folder in memory (tmpfs) for a copy
+    of the run under way, which outlives a daemon that is killed; ``""`` takes one in systemd's runtime
+    directory, and none where there is no such directory.
     """
 
     folder: str = "/var/lib/bricktrack"
+    black_box: str = ""
     margin_mb: Annotated[int, msgspec.Meta(ge=0)] = 256
     delete_confirmed: bool = False
 

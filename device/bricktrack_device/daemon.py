@@ -8,6 +8,7 @@ from types import FrameType
 
 from bricktrack_common.discovery import Announcement
 from bricktrack_common.key_files import fingerprint
+from bricktrack_device.capture.black_box import black_box_folder
 from bricktrack_device.capture.recorder import Recorder
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health.watch import HealthWatch
@@ -70,10 +71,8 @@ class Daemon:
             folder = self._config.keys_folder
             keys = None if folder is None else UnitKeys(folder)
             server = FileServer(self._config.server.address, self._config.server.port, service, keys=keys)
-            for run_id in recover_runs(store):
-                logger.warning(
-                    "%s: recovered after a cut while it was being saved, or a damaged manifest", run_id
-                )
+            for run_id in recover_runs(store, black_box_folder(self._config)):
+                logger.warning("%s: recovered; its manifest says what it lacks", run_id)
             if threading.current_thread() is threading.main_thread():
                 self._heed_signals()
             service.health.refresh_if_due(recorder.state)

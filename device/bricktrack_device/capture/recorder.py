@@ -13,6 +13,7 @@ from collections.abc import Callable
 from bricktrack_common.clocks import check_monotonic_is_boottime, monotonic_ns, read_clock_triplet
 from bricktrack_common.errors import BricktrackError, StorageError
 from bricktrack_common.wire_messages import Armed, DaemonState, Disarmed, Refusal
+from bricktrack_device.capture.black_box import BlackBox, black_box_folder
 from bricktrack_device.capture.commands import (
     Answer,
     ArmCommand,
@@ -31,6 +32,7 @@ from bricktrack_device.capture.state_table import Cause, StateMachine
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.storage.recovery import recover_runs
 from bricktrack_device.storage.run_store import RunStore
 
 logger = logging.getLogger(__name__)
@@ -65,6 +67,7 @@ class Recorder:
         self._stopping = threading.Event()
         self._session: Session | None = None
         self._kept = KeptRun(store, rig)
+        self._black_box = BlackBox(black_box_folder(config))
         self._auto_arm = config.recording.auto_arm
         self._try_again_at = 0.0
         self._last_error = ""
@@ -181,12 +184,16 @@ class Recorder:
                 if session.t0_ns is not None:
                     self._change("first-edge")
                     session.note_trigger()
+                    self._black_box.begin(session.run_id, self._config.video_bytes(session.duration_s))
+                    self._black_box.take_if_due(session.so_far)
                 elif not session.has_sensors:
                     self._fail("no sensor is left: " + "; ".join(session.missing))
                 elif self._auto_arm and session.lost_required:
                     self._fail(f"lost while armed: {session.lost_required}. The unit will arm itself again")
-            elif self.state == "recording" and session.is_over(monotonic_ns()):
-                self._finish()
+            elif self.state == "recording":
+                self._black_box.take_if_due(session.so_far)
+                if session.is_over(monotonic_ns()):
+                    self._finish()
         elif time.monotonic() < self._try_again_at:
             return
         elif self.state == "fault" and self._kept.run_id:
@@ -210,6 +217,8 @@ class Recorder:
         try:
             duration_s = duration_s or self._config.recording.duration_s
             check_monotonic_is_boottime(read_clock_triplet())
+            if self._black_box.holds_runs:  # the card was full when the daemon began
+                recover_runs(self._store, self._black_box.folder)
             make_room(self._config, self._store, duration_s)
             check_room(self._config, self._store, duration_s)
             session = Session(
@@ -290,7 +299,9 @@ class Recorder:
         if session is None:
             return
         # Held from here on, whatever the sensors do when they are let go.
-        self._kept.keep(session.collect(interrupted=interrupted))
+        recording = session.collect(interrupted=interrupted)
+        self._kept.keep(recording)
+        self._black_box.take(lambda: recording)
         ended = time.monotonic()
         self._change("stop" if interrupted else "window-over")
         self._close_session()
@@ -316,6 +327,7 @@ class Recorder:
             self._change("save-failed", reason=reason)
             return False
         self._try_again_at = 0.0
+        self._black_box.forget()
         self._change("saved", run_id=saved.run_id)
         if saved.missing:
             logger.warning(
@@ -340,7 +352,9 @@ class Recorder:
         finally:
             self._close_session()
             self._light.put_out()
-        if self._kept.run_id:
+        if self._kept.run_id == self._black_box.run_id != "":
+            logger.warning("%s: not on the card; a copy waits for the next start", self._kept.run_id)
+        elif self._kept.run_id:
             logger.error("%s: lost from memory; its folder holds what was saved", self._kept.run_id)
         while not self._inbox.empty():
             command = self._inbox.get()

@@ -7,7 +7,7 @@ import logging
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from bricktrack_common.clocks import ClockTriplet, monotonic_ns, read_clock_triplet
 from bricktrack_common.errors import BricktrackError, HardwareError
@@ -30,6 +30,8 @@ LATE_FRAMES_GRACE_S = 1.0
 LATE_EDGES_GRACE_NS = 100_000_000
 """How long after the window's end edges that were stamped within it may still be reported."""
 _STUCK_HIGH_NS = 5_000_000_000
+_UNDER_WAY_NS = 300_000_000
+"""So new pictures may still be in the encoder, and their metadata on the way."""
 _POLL_S = 0.01
 _MOST_BUGS = 20
 """Noted of a run: words that hold a number may be new ones in every tick."""
@@ -260,18 +262,47 @@ class Session:
 
     def collect(self, *, interrupted: str = "") -> Recording:
         """Cut the run out of what was recorded; ``interrupted`` says in words why it ends early."""
-        end_triplet = read_clock_triplet()
-        start_ns, end_ns = self.window_ns
-        until_ns = min(end_ns, end_triplet.monotonic_ns)
+        end = read_clock_triplet()
         if interrupted:
             self.missing.append(interrupted)
             self.log.add("interrupted", words=interrupted)
         if self.trigger is None:
             raise HardwareError("there is no run to collect: the trigger was never watched")
         edges = self.trigger.disarm()
-        wave = self._unless_it_fails("the wave", lambda: self._judge_edges(edges, until_ns), WaveSection())
         for t_ns in edges.rejected_ns:
             self.log.add("rising edge before the first that counts", edge_ns=t_ns)
+        recording = self._recorded(edges, end, state="interrupted" if interrupted else "complete")
+        n_frames = len(recording.video.records) if recording.video else 0
+        self.log.add("collected", frames=n_frames, edges=len(edges.edges_ns))
+        return recording
+
+    def so_far(self) -> Recording:
+        """Return the run as it would be if nothing came after this; the recording goes on."""
+        now = read_clock_triplet()
+        if self.trigger is None:
+            raise HardwareError("there is no run yet: the trigger was never watched")
+        recording = self._recorded(
+            self.trigger.snapshot(), now, until_ns=now.monotonic_ns - _UNDER_WAY_NS, state="interrupted"
+        )
+        recording.missing.append(
+            f"the daemon was killed while it recorded; this is what it had taken{self._when()}"
+        )
+        return recording
+
+    def _recorded(
+        self,
+        edges: EdgeTrain,
+        end: ClockTriplet,
+        *,
+        until_ns: int | None = None,
+        state: Literal["complete", "interrupted"],
+    ) -> Recording:
+        """Cut out what lies in the run's window, up to ``until_ns`` or now."""
+        trigger = self.trigger
+        start_ns, end_ns = self.window_ns
+        until_ns = min(end_ns, until_ns or end.monotonic_ns)
+        unknown: tuple[WaveSection, list[str]] = WaveSection(), []
+        wave, found = self._unless_it_fails("the wave", lambda: self._judge_edges(edges, until_ns), unknown)
         imus = []
         for reader in self.imus:
             taken = self._unless_it_fails(
@@ -279,11 +310,10 @@ class Session:
             )
             if taken is not None:
                 imus.append(taken)
-                self.missing += taken.problems()
+                found += taken.problems()
         video = self._unless_it_fails("video", lambda: self.camera.cut(start_ns, until_ns), None)
         if video is not None:
-            self.missing += video.problems
-        self.log.add("collected", frames=len(video.records) if video else 0, edges=len(edges.edges_ns))
+            found += video.problems
         described: dict[str, str] = self._unless_it_fails("the hardware", self._rig.describe, {})
         hardware = described | {f"sampler of imu {i.name}": i.scheduling for i in self.imus if i.scheduling}
         if self._light.words:
@@ -292,19 +322,19 @@ class Session:
             run_id=self.run_id,
             unit=self._config.unit.name,
             label=self.label,
-            state="interrupted" if interrupted else "complete",
+            state=state,
             simulated=self._rig.simulated,
             hardware=hardware,
             camera=self.camera.section,
             video=video,
             imus=imus,
-            trigger_pin=self.trigger.pin_name,
+            trigger_pin=trigger.pin_name if trigger else "unknown",
             nominal_hz=self._config.trigger.nominal_hz,
             edges=edges,
             wave=wave,
-            clocks=ClocksSection(arm=self._arm_triplet, trigger=self._trigger_triplet, end=end_triplet),
+            clocks=ClocksSection(arm=self._arm_triplet, trigger=self._trigger_triplet, end=end),
             window_ns=(start_ns, end_ns),
-            missing=list(self.missing),
+            missing=self.missing + edges.problems + found,
             log=self.log,
         )
 
@@ -317,17 +347,15 @@ class Session:
                 logger.exception("%s: %s: a bug; the run goes on without", self.run_id, what)
             return otherwise
 
-    def _judge_edges(self, edges: EdgeTrain, until_ns: int) -> WaveSection:
-        """Count what is wrong with the wave, and note it in words."""
-        wave, words = judge_edges(
+    def _judge_edges(self, edges: EdgeTrain, until_ns: int) -> tuple[WaveSection, list[str]]:
+        """Count what is wrong with the wave, and say it in words."""
+        return judge_edges(
             edges.edges_ns,
             nominal_hz=self._config.trigger.nominal_hz,
             end_ns=until_ns,
             rejected_ns=edges.rejected_ns,
             line_is_high=self.trigger.line_is_high if self.trigger else None,
         )
-        self.missing += edges.problems + words
-        return wave
 
     def close(self) -> None:
         """Let go of every sensor, whatever each of them says; what hangs is left behind.

@@ -5,7 +5,9 @@ Nothing goes: what cannot be read is kept under another name.
 
 import logging
 import re
+import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -42,10 +44,17 @@ DAMAGED_SUFFIX = ".damaged"
 T = TypeVar("T")
 
 
-def recover_runs(store: RunStore) -> list[str]:
+def recover_runs(store: RunStore, black_box: Path | None = None) -> list[str]:
     """Turn what a power cut left into runs: finish whole ones, mark the others interrupted.
 
-    A run whose manifest was lost later, by a failing card, is taken up again in the same way.
+    A run whose manifest was lost later, by a failing card, is taken up again in the same way; so is the one
+    of which a killed daemon left a copy in memory.
+
+    Parameters
+    ----------
+    store : RunStore
+    black_box : Path or None
+        Where such copies are (`capture.black_box`).
 
     Returns
     -------
@@ -58,24 +67,53 @@ def recover_runs(store: RunStore) -> list[str]:
             _reopen_if_damaged(folder, store)
         except OSError as e:
             logger.warning("%s: cannot be recovered now: %s", folder, e.strerror or e)
+    copies = sorted(black_box.iterdir()) if black_box is not None and black_box.is_dir() else []
+    not_yet = {copy.name for copy in copies if not _bring_in(copy, store)}
     recovered = []
-    for partial in sorted(store.runs.glob(f"*{PARTIAL_SUFFIX}")):
-        run_id = partial.name.removesuffix(PARTIAL_SUFFIX)
-        if not partial.is_dir() or not is_run_id(run_id):
-            logger.warning("%s: not a run folder's name; left alone", partial)
+    for folder in sorted(store.runs.glob(f"*{PARTIAL_SUFFIX}")):
+        run_id = folder.name.removesuffix(PARTIAL_SUFFIX)
+        if run_id in not_yet:
+            continue
+        if not folder.is_dir() or not is_run_id(run_id):
+            logger.warning("%s: not a run folder's name; left alone", folder)
             continue
         if (store.runs / run_id).exists():
-            logger.warning("%s: a run of this name exists already; left alone", partial)
+            logger.warning("%s: a run of this name exists already; left alone", folder)
             continue
         try:
-            _finish(partial, run_id, store)
+            _finish(folder, run_id, store)
         except OSError as e:
-            logger.warning("%s: cannot be recovered now: %s", partial, e.strerror or e)
+            logger.warning("%s: cannot be recovered now: %s", folder, e.strerror or e)
         except Exception:
-            logger.exception("%s: a bug in its recovery; left alone", partial)
+            logger.exception("%s: a bug in its recovery; left alone", folder)
         else:
             recovered.append(run_id)
     return recovered
+
+
+def _bring_in(copy: Path, store: RunStore) -> bool:
+    """Put a run that a killed daemon left in memory on the card, as one whose saving was cut off.
+
+    The copy goes when the card has it all; what the daemon itself had saved whole is the better one. Tell
+    whether that is so.
+    """
+    run_id = copy.name
+    if not is_run_id(run_id) or not copy.is_dir():
+        logger.warning("%s: not a run folder's name; left alone", copy)
+        return True
+    unfinished = store.runs / (run_id + PARTIAL_SUFFIX)
+    if not (store.runs / run_id).exists() and not _is_whole(unfinished):
+        try:
+            if not unfinished.is_dir():
+                store.disk.make_folder(unfinished)
+            for path in sorted(p for p in copy.iterdir() if re.fullmatch(FILE_NAME_PATTERN, p.name)):
+                with path.open("rb") as contents:
+                    store.disk.write_file(unfinished / path.name, partial(shutil.copyfileobj, contents))
+        except OSError as e:
+            logger.warning("%s: cannot be put on the card now: %s; kept in memory", copy, e.strerror or e)
+            return False
+    shutil.rmtree(copy, ignore_errors=True)
+    return True
 
 
 def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
@@ -99,14 +137,14 @@ def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
     store.disk.rename(folder, folder.with_name(folder.name + PARTIAL_SUFFIX))
 
 
-def _finish(partial: Path, run_id: str, store: RunStore) -> None:
-    if not _is_whole(partial):
-        manifest = rebuild_manifest(partial, run_id, store.unit)
-        entries = [file_entry(p) for p in sorted(partial.iterdir()) if _is_run_file(p)]
+def _finish(folder: Path, run_id: str, store: RunStore) -> None:
+    if not _is_whole(folder):
+        manifest = rebuild_manifest(folder, run_id, store.unit)
+        entries = [file_entry(p) for p in sorted(folder.iterdir()) if _is_run_file(p)]
         manifest = msgspec.structs.replace(manifest, files=entries)
-        store.disk.write_file(partial / MANIFEST_NAME, lambda f: f.write(dump_json(manifest)))
-        store.disk.sync_folder(partial)
-    store.disk.rename(partial, store.runs / run_id)
+        store.disk.write_file(folder / MANIFEST_NAME, lambda f: f.write(dump_json(manifest)))
+        store.disk.sync_folder(folder)
+    store.disk.rename(folder, store.runs / run_id)
 
 
 def _is_run_file(path: Path) -> bool:

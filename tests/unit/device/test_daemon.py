@@ -178,8 +178,11 @@ def test_a_run_is_deleted_when_confirmed_or_by_force_and_never_meanwhile(unit: U
         assert isinstance(refused, Refusal) and refused.code == "busy"
     unit.ask(Disarm())
 
+    n_bytes = sum(p.stat().st_size for p in (unit.config.storage_folder / "runs" / first).iterdir())
     gone, _ = unit.ask(DeleteRun(run_id=first))
-    assert gone == Deleted(run_id=first, n_bytes=sum(f.n_bytes for f in described.files))
+    assert gone == Deleted(run_id=first, n_bytes=n_bytes) and n_bytes > sum(
+        f.n_bytes for f in described.files
+    )
     assert isinstance(unit.ask(DeleteRun(run_id=second, force=True))[0], Deleted)
     listed, _ = unit.ask(ListRuns())
     assert isinstance(listed, RunList) and listed.runs == []

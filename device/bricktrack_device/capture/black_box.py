@@ -1,0 +1,133 @@
+"""A copy of the run under way that outlives the daemon: files in memory, which belong to the system.
+
+Nothing is written to the card while a run is recorded. A daemon that is killed, crashes or hangs meanwhile
+would take the run with it; what is here is brought to the card at its next start (`storage.recovery`).
+"""
+
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+
+from bricktrack_common.run_manifest import VIDEO_NAME
+from bricktrack_common.typed_data import dump_json
+from bricktrack_device.capture.recording import Recording
+from bricktrack_device.capture.room import memory_available_bytes
+from bricktrack_device.capture.saving import build_manifest, streams
+from bricktrack_device.config import DeviceConfig
+from bricktrack_device.storage.run_writer import DRAFT_NAME
+
+logger = logging.getLogger(__name__)
+
+_EVERY_S = 1.0
+_SHARE = 0.05
+"""Of the recorder's time, at most: long runs are copied less often."""
+_ROOM = 2.0
+"""Times the run's video: so much memory must be free, or there is no copy."""
+
+
+def black_box_folder(config: DeviceConfig) -> Path | None:
+    """Return where copies are kept: as configured, else in systemd's runtime directory, else nowhere."""
+    if config.storage.black_box:
+        return Path(config.storage.black_box).expanduser().absolute()
+    runtime = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
+    return Path(runtime) / "black-box" if runtime else None
+
+
+class BlackBox:
+    """Copies of runs, each in a folder named by it; nothing here raises, because the run itself goes on.
+
+    Parameters
+    ----------
+    folder : Path or None
+        In memory (tmpfs); `None` for no copies.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+        self._run: Path | None = None
+        self._n_packets = 0
+        self._due_s = 0.0
+
+    @property
+    def run_id(self) -> str:
+        """Of which run there is a copy; ``""`` if there is none."""
+        return "" if self._run is None else self._run.name
+
+    @property
+    def holds_runs(self) -> bool:
+        """Whether there is a run that a daemon left."""
+        return self.folder is not None and self.folder.is_dir() and any(self.folder.iterdir())
+
+    def begin(self, run_id: str, video_bytes: int) -> None:
+        """Copy this run from now on, if there is room for it in memory."""
+        self._run, self._n_packets, self._due_s = None, 0, 0.0
+        if self.folder is None:
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            free = min(shutil.disk_usage(self.folder).free, memory_available_bytes() or 0)
+            if free < _ROOM * video_bytes:
+                logger.warning(
+                    "%s: no copy in memory: %.0f MB are free for %s, %.0f MB are wanted. A daemon that is "
+                    "killed would lose this run", run_id, free / 1e6, self.folder, _ROOM * video_bytes / 1e6,
+                )  # fmt: skip
+                return
+            run = self.folder / run_id
+            run.mkdir()
+        except OSError as e:
+            logger.warning("%s: no copy in memory: %s: %s", run_id, self.folder, e.strerror or e)
+            return
+        self._run = run
+
+    def take_if_due(self, so_far: Callable[[], Recording]) -> None:
+        """Copy the run as far as it got, if it is time to."""
+        began = time.monotonic()
+        if self._run is None or began < self._due_s:
+            return
+        self.take(so_far)
+        now = time.monotonic()
+        self._due_s = now + max(_EVERY_S, (now - began) / _SHARE)
+
+    def take(self, recorded: Callable[[], Recording]) -> None:
+        """Copy the run: what of its video is new, and all of its small streams."""
+        if self._run is None:
+            return
+        try:
+            self._write(self._run, recorded())
+        except Exception as e:
+            # Without strerror it is a bug, which must not reach the recorder either.
+            logger.warning(
+                "%s: its copy in memory ends: %s", self._run.name, e, exc_info=not isinstance(e, OSError)
+            )
+            self.forget()
+
+    def forget(self) -> None:
+        """Do away with the copy: the run is on the card, or there is no room for both."""
+        run, self._run = self._run, None
+        if run is not None:
+            shutil.rmtree(run, ignore_errors=True)
+
+    def _write(self, run: Path, recording: Recording) -> None:
+        _replace(run / DRAFT_NAME, dump_json(build_manifest(recording)))
+        for name, fill in streams(recording):
+            if name == VIDEO_NAME:
+                continue
+            contents = BytesIO()
+            fill(contents)
+            _replace(run / name, contents.getvalue())
+        if recording.video is not None:
+            packets = recording.video.packets
+            with (run / VIDEO_NAME).open("ab") as file:
+                file.writelines(p.data for p in packets[self._n_packets :])
+            self._n_packets = len(packets)
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Give a file new contents: a process that is killed leaves the old ones or the new."""
+    temporary = path.with_name(f".{path.name}")  # no name of a run's file
+    temporary.write_bytes(data)
+    temporary.rename(path)
