@@ -50,9 +50,42 @@ def rename_durably(source: Path, target: Path) -> None:
     sync_folder(target.parent)
 
 
+def partial_path(path: Path) -> Path:
+    """Return the name beside a file or folder under which it is written before it takes its place.
+
+    Raises
+    ------
+    StorageError
+        If the path ends in no name, as "." does.
+    """
+    if not path.name:
+        raise StorageError(f"{path}: has no name of its own; give the name of what is to be written")
+    return path.with_name(f".{path.name}.partial")
+
+
+@contextmanager
+def written_whole(path: Path, remedy: str) -> Iterator[Path]:
+    """Give the name to write a file under; all being well it then takes its place, durably, and else goes.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be written; with the remedy.
+    """
+    with storage_errors(path, remedy):
+        partial = partial_path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield partial
+            sync_file(partial)
+            rename_durably(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
 def replace_durably(path: Path, data: bytes) -> None:
     """Write a file in place of one of before, whole or not at all; after return it survives a power cut."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = partial_path(path)
     partial.unlink(missing_ok=True)
     write_durably(partial, data)
     rename_durably(partial, path)
@@ -91,11 +124,11 @@ def write_folder_whole(
     StorageError
         If the folder exists and is somebody else's, or cannot be written.
     """
-    partial = folder.with_name(f".{folder.name}.partial")
+    partial = partial_path(folder)
     previous = folder.with_name(f".{folder.name}.previous")
-    if folder.exists() and not (folder / marker).is_file():
-        raise StorageError(f"{folder} exists and holds no {marker}; it is left alone. Move it away")
     with storage_errors(folder, "Results cannot be written; make room, or choose another folder"):
+        if folder.exists() and not (folder / marker).is_file():
+            raise StorageError(f"{folder} exists and holds no {marker}; it is left alone. Move it away")
         if previous.exists() and not folder.exists():  # killed between the two renames below
             previous.rename(folder)
         for leftover in (partial, previous):

@@ -1,6 +1,8 @@
 """How the command line ends: an error is one red line, an interruption one line, a bug its traceback."""
 
+import errno
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -21,7 +23,7 @@ class BricktrackGroup(TyperGroup):
         super().__init__(**attributes)
         tidy_help(self)
         for command in self.commands.values():
-            take_finite_numbers_only(command)
+            refuse_strange_values(command)
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; exit with 1 after a `BricktrackError`, with 130 after Ctrl-C."""
@@ -35,21 +37,36 @@ class BricktrackGroup(TyperGroup):
             raise typer.Exit(EXIT_INTERRUPTED) from e
 
 
-def take_finite_numbers_only(command: Any) -> None:
-    """Have a command, or those below a group, refuse "nan" and "inf", which pass every limit of an option."""
+def refuse_strange_values(command: Any) -> None:
+    """Have a command, or those below a group, refuse numbers and paths that pass every limit of an option.
+
+    They are "nan" and "inf", and names longer than the file system takes, which fail wherever they are used.
+    """
     children = getattr(command, "commands", None)
     if children is not None:
         for child in children.values():
-            take_finite_numbers_only(child)
+            refuse_strange_values(child)
         return
     invoke = command.invoke
 
     def checked(context: Any) -> Any:
         for parameter in command.params:
             value = context.params.get(parameter.name)
-            for number in value if isinstance(value, (list, tuple)) else (value,):
-                if isinstance(number, float) and not isfinite(number):
-                    raise typer.BadParameter(f"{number} is no finite number", ctx=context, param=parameter)
+            for one in value if isinstance(value, (list, tuple)) else (value,):
+                if why := _why_strange(one):
+                    raise typer.BadParameter(why, ctx=context, param=parameter)
         return invoke(context)
 
     command.invoke = checked
+
+
+def _why_strange(value: object) -> str:
+    if isinstance(value, float) and not isfinite(value):
+        return f"{value} is no finite number"
+    if isinstance(value, Path):
+        try:
+            value.lstat()
+        except OSError as e:
+            if e.errno == errno.ENAMETOOLONG:
+                return f"{value.name[:40]}...: longer than a name can be"
+    return ""

@@ -13,6 +13,7 @@ from bricktrack_common.errors import ConfigError
 from bricktrack_host.cli._console import out
 from bricktrack_host.cli._progress import counting_bar
 from bricktrack_host.cli._stage_bar import StageBar, stage_bar
+from bricktrack_host.durable_files import storage_errors
 
 if TYPE_CHECKING:
     from bricktrack_host.evaluation.scores import SweepScore
@@ -80,6 +81,8 @@ def evaluate(
     """
     if (run is None) != (positions is None):
         raise ConfigError("a recorded sweep needs both RUN and --positions; a simulated one neither")
+    with storage_errors(output, "Choose another folder with --output, or make room"):
+        output.mkdir(parents=True, exist_ok=True)  # before work of minutes
     if run is not None and positions is not None:
         _recorded(run, positions, align=align, output=output, as_json=as_json)
     elif images:

@@ -96,7 +96,6 @@ def write_page(
     figures: Sequence[tuple[Figure, str]],
 ) -> list[Path]:
     """Write a page that needs nothing beside it, and each figure as PNG beside it; return all paths."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     embedded, written = [], [path]
     for k, (figure, caption) in enumerate(figures):
         with rc_context(_STYLE):

@@ -7,6 +7,7 @@ from pathlib import Path
 import jinja2
 
 from bricktrack_common.errors import StorageError
+from bricktrack_host.durable_files import partial_path
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ def write_page(path: Path, html: str) -> None:
     StorageError
         If it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
+    partial = partial_path(path)
     try:
         partial.write_text(html, encoding="utf-8")
         partial.replace(path)

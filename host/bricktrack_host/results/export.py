@@ -11,7 +11,7 @@ import pyarrow.parquet
 import scipy.io
 
 from bricktrack_common.errors import RunFormatError
-from bricktrack_host.durable_files import rename_durably, storage_errors, sync_file
+from bricktrack_host.durable_files import written_whole
 from bricktrack_host.results.table_files import read_parquet
 
 Format = Literal["csv", "mat", "parquet"]
@@ -62,12 +62,8 @@ def write_table(table: "pa.Table", path: Path, form: Format) -> None:
     StorageError
         If it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
-    with storage_errors(path, "Choose another --output, or make room"):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path, "Choose another --output, or make room") as partial:
         _WRITERS[form](table, partial)
-        sync_file(partial)
-        rename_durably(partial, path)
 
 
 def _write_csv(table: "pa.Table", path: Path) -> None:

@@ -11,7 +11,7 @@ from av.video.frame import VideoFrame
 
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.run_folder import read_run
-from bricktrack_host.durable_files import rename_durably, storage_errors, sync_file
+from bricktrack_host.durable_files import written_whole
 from bricktrack_host.recordings.video_frames import decode_run_video
 from bricktrack_host.results.result_store import read_result
 from bricktrack_host.viewing.overlay import STRIP_ROWS, Image, OverlayArtist
@@ -62,37 +62,32 @@ def write_overlay(
         raise RunFormatError(f"frames {first}:{stop}: the run has frames 0 to {stamps.n_frames - 1}")
     stop = min(stop, stamps.n_frames)
     artist = OverlayArtist.of(result, mode.width, mode.height, frames=(first, stop))
-    partial = output.with_name(f".{output.name}.partial")
     n = 0
-    with storage_errors(output, "Choose another --output, or make room"):
-        output.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with av.open(str(partial), "w", format="mp4") as film:
-                stream = film.add_stream("libx264", rate=_RATE, options={"crf": "20", "preset": "veryfast"})
-                stream.pix_fmt = "yuv420p"
-                # 4:2:0 has whole squares of four pixels only.
-                stream.width = int(mode.width * scale) // 2 * 2
-                stream.height = int((mode.height + STRIP_ROWS) * scale) // 2 * 2
-                stream.time_base = stream.codec_context.time_base = _TIME_BASE
-                t0_ns = int(stamps.sensor_timestamp_ns[first])
-                for frame in decode_run_video(video, stamps):
-                    if frame.index >= stop:
-                        break
-                    if frame.index < first:
-                        continue
-                    drawn = artist.draw(frame.index, None if frame.picture is None else frame.picture.luma)
-                    shown = _fit(drawn, stream.width, stream.height)
-                    shown.pts = round((frame.sensor_timestamp_ns - t0_ns) / 1000 * slow)
-                    shown.time_base = _TIME_BASE
-                    film.mux(stream.encode(shown))
-                    n += 1
-                    if progress is not None:
-                        progress(n, stop - first)
-                film.mux(stream.encode())
-            sync_file(partial)
-            rename_durably(partial, output)
-        finally:
-            partial.unlink(missing_ok=True)
+    with (
+        written_whole(output, "Choose another --output, or make room") as partial,
+        av.open(str(partial), "w", format="mp4") as film,
+    ):
+        stream = film.add_stream("libx264", rate=_RATE, options={"crf": "20", "preset": "veryfast"})
+        stream.pix_fmt = "yuv420p"
+        # 4:2:0 has whole squares of four pixels only.
+        stream.width = int(mode.width * scale) // 2 * 2
+        stream.height = int((mode.height + STRIP_ROWS) * scale) // 2 * 2
+        stream.time_base = stream.codec_context.time_base = _TIME_BASE
+        t0_ns = int(stamps.sensor_timestamp_ns[first])
+        for frame in decode_run_video(video, stamps):
+            if frame.index >= stop:
+                break
+            if frame.index < first:
+                continue
+            drawn = artist.draw(frame.index, None if frame.picture is None else frame.picture.luma)
+            shown = _fit(drawn, stream.width, stream.height)
+            shown.pts = round((frame.sensor_timestamp_ns - t0_ns) / 1000 * slow)
+            shown.time_base = _TIME_BASE
+            film.mux(stream.encode(shown))
+            n += 1
+            if progress is not None:
+                progress(n, stop - first)
+        film.mux(stream.encode())
     return n
 
 

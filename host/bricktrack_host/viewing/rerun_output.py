@@ -9,7 +9,7 @@ import rerun as rr
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_common.run_folder import Run
-from bricktrack_host.durable_files import rename_durably, storage_errors, sync_file
+from bricktrack_host.durable_files import written_whole
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.viewing.rerun_blueprint import run_blueprint
 from bricktrack_host.viewing.rerun_recording import APPLICATION, Belongings, record_run, timeline_of
@@ -35,19 +35,12 @@ def save_recording(
     StorageError
         If the file cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
-    with storage_errors(path, "Choose another file for --save, or make room"):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path, "Choose another file for --save, or make room") as partial:
         partial.write_bytes(b"")  # what is wrong with the place is said by the system's own error
-        try:
-            stream = _stream(result)
-            stream.save(partial, default_blueprint=_arranged(result, belongings))
-            record_run(stream, run, result, belongings, with_video=with_video, progress=progress)
-            stream.disconnect()
-            sync_file(partial)
-            rename_durably(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+        stream = _stream(result)
+        stream.save(partial, default_blueprint=_arranged(result, belongings))
+        record_run(stream, run, result, belongings, with_video=with_video, progress=progress)
+        stream.disconnect()
 
 
 def show_recording(

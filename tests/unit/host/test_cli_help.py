@@ -105,6 +105,13 @@ def test_what_is_no_number_is_refused_before_anything_is_done(before, number):
     assert before[-1 if before[-1].startswith("-") else -2] in done.output
 
 
+@pytest.mark.parametrize("before", [["report"], ["status", "--fleet"], ["dataset", "add", "campaign"]])
+def test_a_name_that_no_file_can_have_is_refused_before_anything_is_done(before):
+    done = CliRunner().invoke(bricktrack, [*before, "x" * 300])
+    assert done.exit_code == 2
+    assert "longer than a name can be" in " ".join(done.output.split())
+
+
 def test_a_shell_takes_an_example_as_it_is_shown():
     words = ["--picture", "101.117=near.png", "--picture", "161.111=far.png", "--origin-near", "960", "540"]
     example = flowing(" ".join(["bricktrack", "calibrate", "fit", *words]))

@@ -8,7 +8,7 @@ import pytest
 
 from bricktrack_common.errors import StorageError
 from bricktrack_host import durable_files
-from bricktrack_host.durable_files import require_writable, write_folder_whole
+from bricktrack_host.durable_files import require_writable, write_folder_whole, written_whole
 
 
 def test_nothing_is_left_where_the_disk_is_full(tmp_path):
@@ -19,6 +19,26 @@ def test_nothing_is_left_where_the_disk_is_full(tmp_path):
     with pytest.raises(StorageError, match="no space left.*make room"):
         write_folder_whole(tmp_path / "results", write, marker="summary.json")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_takes_its_place_when_it_is_whole_and_leaves_the_old_one_otherwise(tmp_path):
+    film = tmp_path / "films" / "shake.mp4"
+    with written_whole(film, "") as partial:
+        partial.write_text("first")
+    with pytest.raises(ZeroDivisionError), written_whole(film, "") as partial:
+        partial.write_text("half")
+        raise ZeroDivisionError
+    assert [(path.name, path.read_text()) for path in film.parent.iterdir()] == [("shake.mp4", "first")]
+
+
+def test_a_place_without_a_name_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for place in (Path(), Path("/")):
+        with pytest.raises(StorageError, match="no name of its own"), written_whole(place, ""):
+            pass
+        with pytest.raises(StorageError, match="no name of its own"):
+            write_folder_whole(place, lambda _: None, marker="summary.json")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_can_be_made_or_written_is_taken(tmp_path):
