@@ -199,7 +199,7 @@ class SawToothSearch:
 
         ``lags_s``: offsets less the coarse one, beside the samples' ages; of all phases, or of each.
         """
-        lags = np.ascontiguousarray(np.broadcast_to(lags_s, (len(phases_s), lags_s.shape[-1])))
+        lags = np.broadcast_to(lags_s, (len(phases_s), lags_s.shape[-1])).copy()
         period = self.period_s * (1 + rate) if period_s is None else period_s
         since_mid = self._bin_s - self._mid_s
         return optics_cost(self._cost, since_mid, self._lags_s[0], STEP_S, period, rate, phases_s, lags)

@@ -38,6 +38,7 @@ class SeenLeds:
     uv_px, cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
     spread_ns : ndarray, shape (m,), ns
         Standard deviation of the instants at which its light was gathered: by exposure, and by its rows.
+    exposure_ns : ndarray, shape (m,), ns
     """
 
     frame: IntArray
@@ -46,6 +47,7 @@ class SeenLeds:
     uv_px: FloatArray
     cov_px2: FloatArray
     spread_ns: FloatArray
+    exposure_ns: FloatArray
 
     @classmethod
     def of(cls, observations: LedObservations, ray_model: RayModel) -> "SeenLeds":
@@ -62,7 +64,7 @@ class SeenLeds:
         row_ns = ray_model.sensor_mode.row_delay_ns(1.0) - ray_model.sensor_mode.row_delay_ns(0.0)
         spread_ns = np.hypot(observations.exposure_ns[frame] / np.sqrt(12), rows * row_ns)
         return cls(frame, led, t_ns[frame, led], observations.uv_px[frame, led],
-                   observations.cov_px2[frame, led], spread_ns)  # fmt: skip
+                   observations.cov_px2[frame, led], spread_ns, observations.exposure_ns[frame] * 1.0)  # fmt: skip
 
     def take(self, rows: BoolArray) -> "SeenLeds":
         """Return some of the rows."""
@@ -97,6 +99,8 @@ class Pictured:
         Cosine of the angle that the LED is seen at; at 0 and less nothing of the dome can be seen.
     side_on_px : ndarray, shape (m, 2)
         One radius along the LED's axis as it is seen.
+    leaning_px : ndarray, shape (m, 2)
+        What the smear draws a centroid aside by, over a share that is one for all; see `_leaning_px`.
     """
 
     R_camera_brick: FloatArray
@@ -109,6 +113,7 @@ class Pictured:
     from_side_rad: FloatArray
     facing: FloatArray
     side_on_px: FloatArray
+    leaning_px: FloatArray
 
     @property
     def is_facing(self) -> BoolArray:
@@ -144,7 +149,26 @@ def picture(
         from_side_rad=_from_side(leds, R_camera_brick[0], t_camera_brick_mm[0], brick),
         facing=prediction.facing,
         side_on_px=prediction.model_shift_px,
+        leaning_px=_leaning_px(
+            prediction, (after.uv_px - before.uv_px) * (0.5 * leds.exposure_ns / leds.spread_ns)[:, None]
+        ),
     )
+
+
+def _leaning_px(prediction: LedPrediction, smear_px: FloatArray) -> FloatArray:
+    """Return the smear, shape (m, 2), times how far each LED leans from the line of sight.
+
+    A smear turns the rim of a light into a ramp as wide as the way across it. A bright rim reaches the level
+    that counts as light early in the ramp, a dim one later: it grows outwards by more, whichever way the LED
+    moves. A dome's rim is not evenly bright, by its limb, collar or hot spot along the axis a as it is seen
+    (its length the sine of the angle). With s the smear and n the outward normal, the ramp is ``|s . n|``
+    wide: the mean over the rim of that times ``a . n``, along n, is ``|s| (1 + s s' / |s|^2) a`` times a
+    share that brightness and exposure decide.
+    """
+    a = prediction.model_shift_px / np.sqrt(prediction.area_px2 / np.pi)[:, None]
+    length = np.linalg.norm(smear_px, axis=1, keepdims=True)
+    along = smear_px * np.sum(smear_px * a, axis=1, keepdims=True) / np.maximum(length, 1e-9)
+    return np.asarray(length * a + along)
 
 
 def _from_side(leds: SeenLeds, R: FloatArray, t_mm: FloatArray, brick: BrickModel) -> FloatArray:
@@ -235,7 +259,7 @@ def led_arrays(
         camera_omega_radps=turned,
         camera_dv_mps=felt[:, 0].copy(),
         camera_dp_m=felt[:, 1].copy(),
-        R_lin=R_lin,
+        R_lin=np.ascontiguousarray(R_lin),  # the smoother is not compiled, and loaded, twice
         t_lin_m=t_lin_m,
         residual_px=pictured.residual_px,
         J=J,
