@@ -34,12 +34,16 @@ from bricktrack_device.capture.recorder import Recorder
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health.machine import processor_temperature_degc
 from bricktrack_device.health.watch import HealthWatch
+from bricktrack_device.in_time import in_time
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.network.file_server import Answer
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.remote_settings import RemoteSettings
 from bricktrack_device.still import encode_still, take_still
+from bricktrack_device.storage.recovery import describe_anew_if_altered
 from bricktrack_device.storage.run_store import RunStore
+
+_CHECK_TIMEOUT_S = 120.0
 
 
 class UnitService:
@@ -96,8 +100,7 @@ class UnitService:
                 self._read(request, answer)
             case Confirm():
                 self._refuse_while("recording", "saving")
-                self._store.confirm(request.run_id, request.sha256)
-                answer(Confirmed(run_id=request.run_id), None)
+                self._confirm(request, answer)
             case DeleteRun():
                 self._refuse_while("armed", "recording", "saving")
                 n_bytes = self._store.delete(request.run_id, force=request.force)
@@ -129,7 +132,30 @@ class UnitService:
         )
         answer(chunk, data)
 
+    def _confirm(self, request: Confirm, answer: Answer) -> None:
+        try:
+            self._store.confirm(request.run_id, request.sha256)
+        except RequestRefusedError as e:
+            if e.code != "hash-mismatch" or self.is_busy:
+                raise
+            words = str(e)
+            self._when_idle("checking a run", lambda: self._look_for_altered(request.run_id, words), answer)
+        else:
+            answer(Confirmed(run_id=request.run_id), None)
+
     # In the recorder's thread, while nothing is recorded
+
+    def _look_for_altered(self, run_id: str, words: str) -> None:
+        """Refuse hashes that are not the manifest's, after a look at whether the card altered the files."""
+        altered = in_time(
+            "checking a run",
+            lambda: describe_anew_if_altered(self._store, run_id),
+            _CHECK_TIMEOUT_S,
+            beat=self._recorder.beat,
+        )
+        if altered:
+            words += f". The card has altered {', '.join(altered)}; the run is described anew: pull it again"
+        raise RequestRefusedError("hash-mismatch", words)
 
     def _still(self, request: TakeStill, answer: Answer) -> None:
         taken = take_still(

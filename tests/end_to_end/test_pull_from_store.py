@@ -1,11 +1,17 @@
 """The host's client against the device's own file server and run store, without cameras or sensors."""
 
+import threading
+import time
+
 import pytest
+from device_fakes import FakeRig
 from run_folders import contents, make_run
+from saved_runs import save_one, store_in
 
 from bricktrack_common.checksums import crc32
 from bricktrack_common.clocks import read_clock_triplet
 from bricktrack_common.errors import TransferError, UnitError
+from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import (
     Chunk,
     Confirm,
@@ -19,9 +25,12 @@ from bricktrack_common.wire_messages import (
     RunList,
     StatusReply,
 )
+from bricktrack_device.config import DeviceConfig, ServerTable, StorageTable, UnitTable
+from bricktrack_device.daemon import Daemon
 from bricktrack_device.network.file_server import FileServer
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.storage.run_store import RunStore
+from bricktrack_device.storage.run_writer import DRAFT_NAME
 from bricktrack_host.transfer.fleet_config import UnitConfig
 from bricktrack_host.transfer.pull import pull_unit
 from bricktrack_host.transfer.unit_client import UnitClient
@@ -125,3 +134,63 @@ def test_refusals_of_the_real_server_have_their_codes(served):
                 ask()
             assert refused.value.code == code
         assert client.hello().unit == "b1"
+
+
+@pytest.fixture
+def daemon(tmp_path):
+    """A card with two runs, and what serves it."""
+    store = store_in(tmp_path / "card")
+    run_ids = [save_one(store), save_one(store)]
+    config = DeviceConfig(
+        unit=UnitTable(name="unit-1"), storage=StorageTable(folder=str(store.folder)),
+        server=ServerTable(port=0), imu=[],
+    )  # fmt: skip
+    daemon = Daemon(config, FakeRig())
+    thread = threading.Thread(target=daemon.run)
+    thread.start()
+    while not daemon.port:
+        assert thread.is_alive()
+        time.sleep(0.01)
+    yield store.runs, run_ids, UnitConfig(name="unit-1", address=f"tcp://127.0.0.1:{daemon.port}")
+    daemon.stop()
+    thread.join()
+
+
+def flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 8
+    path.write_bytes(data)
+
+
+def shorten(path):
+    path.write_bytes(path.read_bytes()[:50])
+
+
+@pytest.mark.parametrize("damage", [flip, shorten, lambda path: path.unlink()])
+def test_a_run_that_the_card_has_altered_comes_as_it_is_and_says_so(daemon, tmp_path, damage):
+    runs, (altered, whole), unit = daemon
+    damage(runs / altered / "video.h264")
+    result = pull_unit(unit, tmp_path / "here")
+    assert result.errors == [] and [r.run_id for r in result.runs] == [altered, whole]
+    run = read_run(tmp_path / "here" / altered, verify_hashes=True)
+    assert run.manifest.state == "interrupted"
+    assert any("video.h264: the card altered it" in words for words in run.manifest.missing)
+    assert run.imus and run.edges_ns.size and run.manifest.camera is not None
+    on_card = contents(runs / altered)
+    on_card.pop(DRAFT_NAME)
+    assert contents(tmp_path / "here" / altered) == on_card
+    with UnitClient(unit.address) as client:
+        assert all(r.confirmed for r in client.list_runs().runs)
+    assert [r.outcome for r in pull_unit(unit, tmp_path / "here").runs] == ["already here"] * 2
+
+
+def test_hashes_that_are_merely_wrong_are_refused_and_change_nothing(daemon):
+    runs, (run_id, _), unit = daemon
+    before = contents(runs / run_id)
+    with UnitClient(unit.address) as client:
+        n_files = len(client.describe_run(run_id).files)
+        with pytest.raises(UnitError) as refused:
+            client.confirm(run_id, ["0" * 64] * n_files)
+        assert refused.value.code == "hash-mismatch" and "pull it again" not in str(refused.value)
+        assert not any(r.confirmed for r in client.list_runs().runs)
+    assert contents(runs / run_id) == before

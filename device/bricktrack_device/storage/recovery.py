@@ -6,7 +6,7 @@ Nothing goes: what cannot be read is kept under another name.
 import logging
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -24,6 +24,7 @@ from bricktrack_common.run_manifest import (
     MANIFEST_NAME,
     VIDEO_NAME,
     ClocksSection,
+    FileEntry,
     NewerRunError,
     QualitySection,
     RunManifest,
@@ -137,14 +138,61 @@ def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
     store.disk.rename(folder, folder.with_name(folder.name + PARTIAL_SUFFIX))
 
 
-def _finish(folder: Path, run_id: str, store: RunStore) -> None:
+def describe_anew_if_altered(store: RunStore, run_id: str) -> list[str]:
+    """Compare a run's files with the manifest; where the card altered or lost one, describe them as they are.
+
+    Returns
+    -------
+    altered : list of str
+        The files' names. The manifest made anew says so, and counts the run as interrupted.
+
+    Raises
+    ------
+    RunFormatError
+        If the manifest cannot be read.
+    OSError
+        If the card fails.
+    """
+    folder = store.runs / run_id
+    path = folder / MANIFEST_NAME
+    altered = [f.name for f in read_manifest(path).files if _entry(folder / f.name) != f]
+    if altered:
+        logger.warning("%s: altered on the card since it was saved: %s", run_id, ", ".join(altered))
+        store.forget(run_id)
+        store.disk.rename(path, path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX))
+        unfinished = store.runs / (run_id + PARTIAL_SUFFIX)
+        store.disk.rename(folder, unfinished)
+        words = [
+            f"{name}: the card altered it after it was saved; what is left is as found" for name in altered
+        ]
+        _finish(unfinished, run_id, store, words)
+    return altered
+
+
+def _finish(folder: Path, run_id: str, store: RunStore, words: Sequence[str] = ()) -> None:
     if not _is_whole(folder):
         manifest = rebuild_manifest(folder, run_id, store.unit)
-        entries = [file_entry(p) for p in sorted(folder.iterdir()) if _is_run_file(p)]
-        manifest = msgspec.structs.replace(manifest, files=entries)
+        found = {p.name: _entry(p) for p in sorted(folder.iterdir()) if _is_run_file(p)}
+        unreadable = [
+            f"{name} is on the card and cannot be read" for name, entry in found.items() if not entry
+        ]
+        manifest = msgspec.structs.replace(
+            manifest,
+            missing=[*manifest.missing, *words, *unreadable],
+            files=[entry for entry in found.values() if entry],
+        )
         store.disk.write_file(folder / MANIFEST_NAME, lambda f: f.write(dump_json(manifest)))
         store.disk.sync_folder(folder)
     store.disk.rename(folder, store.runs / run_id)
+
+
+def _entry(path: Path) -> FileEntry | None:
+    """Return name, size and hash of a file; `None` of one that the card does not give."""
+    try:
+        return file_entry(path)
+    except OSError as e:
+        logger.warning("%s: %s", path, e.strerror or e)
+        return None
 
 
 def _is_run_file(path: Path) -> bool:

@@ -255,6 +255,12 @@ class RunStore:
         confirmed = self._confirmations.run_ids()
         return sum(1 for folder in self.folders() if folder.name not in confirmed)
 
+    def forget(self, run_id: str) -> None:
+        """Read a run's manifest again when it is asked for next, and its files."""
+        self._files.close(run_id)
+        with self._lock:
+            self._runs_known.pop(run_id, None)
+
     def delete(self, run_id: str, *, force: bool = False) -> int:
         """Remove a run that a host has confirmed, or any with ``force``; return how many bytes it had.
 

@@ -38,6 +38,8 @@ _MIN_CHUNK_BYTES = 16 * 1024
 _CHUNKS_AT_ONCE = 2048  # 512 MiB: however long a unit says that a file is, the list of its chunks is not
 _FIRST_BACKOFF_S = 0.25
 _MAX_BACKOFF_S = 5.0
+_LOOK_AGAIN_S = 150.0
+_NOT_TO_BE_HAD = "0" * 64
 
 ClientFactory = Callable[[], AbstractContextManager[UnitClient]]
 
@@ -122,6 +124,15 @@ def pull_run(
         backoff_s = min(2 * backoff_s, _MAX_BACKOFF_S)
 
 
+class _AlteredError(TransferError):
+    """A unit's file is, again and again, another than its manifest says, or cannot be read there."""
+
+    def __init__(self, message: str, name: str, found: str) -> None:
+        super().__init__(message)
+        self.name = name
+        self.found = found
+
+
 class _RunTransfer:
     """One run on its way; `run` may be called again with a new connection after a `UnitTimeoutError`."""
 
@@ -147,11 +158,35 @@ class _RunTransfer:
         if self.folder.exists():
             self._check_present(description)
         else:
-            self._fetch(client, description)
+            try:
+                self._fetch(client, description)
+            except _AlteredError as e:
+                description = self._described_anew(client, description, e)
+                n_bytes = sum(f.n_bytes for f in description.files)
+                self._fetch(client, description)
         self._tell(n_bytes)
         client.confirm(self.run_id, [f.sha256 for f in description.files])
         outcome: Literal["pulled", "already here"] = "pulled" if self._was_fetched else "already here"
         return PulledRun(self.run_id, self.folder, outcome, n_bytes, self.n_bytes_fetched)
+
+    def _described_anew(
+        self, client: UnitClient, description: RunDescription, altered: "_AlteredError"
+    ) -> RunDescription:
+        """Tell the unit what its card gives now; return how it then describes the run, or give up on it."""
+        hashes = [altered.found if f.name == altered.name else f.sha256 for f in description.files]
+        try:
+            client.confirm(self.run_id, hashes, timeout_s=_LOOK_AGAIN_S)
+        except UnitError as e:
+            if e.code != "hash-mismatch":
+                raise altered from e
+        anew = client.describe_run(self.run_id)
+        if anew == description:
+            raise altered
+        _check_description(anew)
+        self._note(
+            f"{self.run_id}: the unit's card altered it after it was saved; it comes as it is, and says so"
+        )
+        return anew
 
     def _check_present(self, description: RunDescription) -> None:
         for file in description.files:
@@ -188,6 +223,7 @@ class _RunTransfer:
             )
 
     def _fetch_file(self, client: UnitClient, part: PartFolder, index: int, file: FileSummary) -> None:
+        found_before = ""
         for attempt in (1, 2):
             try:
                 missing = part.missing_chunks(file.name, self.chunk_bytes)
@@ -196,8 +232,10 @@ class _RunTransfer:
                         part.write(file.name, chunk)
                         self.n_bytes_fetched += len(chunk.data)
                         self._tell(part.n_bytes_verified)
-            except TransferError as e:
-                raise TransferError(f"{self.run_id}: {file.name}: {e}") from e
+            except (TransferError, UnitError) as e:
+                if isinstance(e, UnitError) and e.code != "internal":
+                    raise
+                raise _AlteredError(f"{self.run_id}: {file.name}: {e}", file.name, _NOT_TO_BE_HAD) from e
             found = part.sha256(file.name)
             if found == file.sha256:
                 return
@@ -207,8 +245,13 @@ class _RunTransfer:
                 f"{self.run_id}: {file.name} arrived with SHA-256 {found[:12]}..., the unit says "
                 f"{file.sha256[:12]}...; kept as {kept}"
             )
+            if found == found_before:
+                raise _AlteredError(f"{problem}. Twice: the unit's card is suspect", file.name, found)
             if attempt == 2:
-                raise TransferError(f"{problem}. Twice: the unit's card or memory is suspect")
+                raise TransferError(
+                    f"{problem}. Twice, and not the same: the unit's card or memory is suspect"
+                )
+            found_before = found
             self._note(f"{problem}; fetching it again")
 
     def _check_manifest(self, path: Path, description: RunDescription) -> None:

@@ -162,9 +162,13 @@ class UnitClient:
             raise ProtocolError(f"{self.address}: described run {reply.run_id}; asked for {run_id}")
         return reply
 
-    def confirm(self, run_id: str, sha256: list[str]) -> Confirmed:
-        """Tell the unit that these files, in the order of its description, are verified and on disk here."""
-        return self._connection.ask(Confirm(run_id=run_id, sha256=sha256), Confirmed)
+    def confirm(self, run_id: str, sha256: list[str], *, timeout_s: float | None = None) -> Confirmed:
+        """Tell the unit that these files, in the order of its description, are verified and on disk here.
+
+        Told other hashes than it has described, a unit reads its files again, which takes a while; where its
+        card has altered one it describes the run anew. Either way it refuses them.
+        """
+        return self._connection.ask(Confirm(run_id=run_id, sha256=sha256), Confirmed, timeout_s=timeout_s)
 
     def delete_run(self, run_id: str, *, force: bool = False, timeout_s: float = 30.0) -> Deleted:
         """Remove a run from the unit: one that a host has confirmed, or any with ``force``."""

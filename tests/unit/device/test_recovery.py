@@ -1,3 +1,5 @@
+import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -5,12 +7,9 @@ import pytest
 from saved_runs import BOOT, T0, CutDisk, PowerCut, save_one, store_in
 
 from bricktrack_common.run_folder import read_run
-from bricktrack_common.run_manifest import (
-    RunManifest,
-    read_manifest,
-)
+from bricktrack_common.run_manifest import FileEntry, RunManifest, file_entry, read_manifest
 from bricktrack_device.storage import recovery
-from bricktrack_device.storage.recovery import recover_runs
+from bricktrack_device.storage.recovery import describe_anew_if_altered, recover_runs
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME
 
@@ -122,3 +121,48 @@ def test_a_bug_in_a_recovery_leaves_the_folder_alone_and_the_unit_comes_up(
     monkeypatch.setattr(recovery, "rebuild_manifest", break_down)
     assert recover_runs(store_in(tmp_path)) == [folders[1].name]
     assert folders[0].with_name(folders[0].name + ".partial").is_dir()
+
+
+def test_files_that_the_card_altered_are_described_as_they_are_now_and_named(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    run_id, other = save_one(store), save_one(store)
+    assert describe_anew_if_altered(store, run_id) == []
+    before = store.describe(run_id)
+    folder = tmp_path / "runs" / run_id
+    video = bytearray((folder / "video.h264").read_bytes())
+    video[500] ^= 4
+    (folder / "video.h264").write_bytes(video)
+    (folder / "edges.msgpack").unlink()
+    (folder / "imu_brick.msgpack").write_bytes(b"\xc1" * 100)
+    store.read_chunk(run_id, 0, 0, 10)  # known, and open
+
+    altered = describe_anew_if_altered(store, run_id)
+    assert sorted(altered) == ["edges.msgpack", "imu_brick.msgpack", "video.h264"]
+    run = read_run(folder, verify_hashes=True)
+    m = run.manifest
+    assert m.state == "interrupted" and m.camera is not None and (run.video or folder).read_bytes() == video
+    for name in altered:
+        assert any(words.startswith(f"{name}: the card altered it") for words in m.missing)
+    assert not run.imus and not run.edges_ns.size and m.file("imu_brick.msgpack.damaged") is not None
+    assert store.describe(run_id) != before and len(store.list_runs()) == 2
+    assert describe_anew_if_altered(store, run_id) == []
+    assert describe_anew_if_altered(store, other) == []
+
+
+def test_a_file_that_the_card_does_not_give_is_left_out_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_in(tmp_path)
+    run_id = save_one(store)
+
+    def failing(path: Path) -> FileEntry:
+        if path.name == "video.h264":
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return file_entry(path)
+
+    monkeypatch.setattr(recovery, "file_entry", failing)
+    assert describe_anew_if_altered(store, run_id) == ["video.h264"]
+    run = read_run(tmp_path / "runs" / run_id, verify_hashes=True)
+    assert run.video is None and run.frames is not None and len(run.manifest.files) > 4
+    assert "video.h264 is on the card and cannot be read" in run.manifest.missing
+    assert (tmp_path / "runs" / run_id / "video.h264").exists()
