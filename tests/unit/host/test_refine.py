@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.pose.prsoi import prsoi_starts
-from bricktrack_host.tracking.pose.refine import LedMotion, refine_poses
+from bricktrack_host.tracking.pose.refine import LedMotion, pose_equations, refine_poses
 
 CAMERA = PinholeCamera()
 SD_PX = 0.06
@@ -235,3 +235,35 @@ def test_a_profile_that_is_off_moves_the_pose_as_is_said():
     assert rest == pytest.approx(
         by_profile, abs=1e-12
     )  # no twist: what is not the centroids' is the profile's
+
+
+def test_equations_of_poses_hold_the_fits_covariance_and_lead_to_its_pose():
+    brick = seven_leds(collar_mm=0.7)
+    R, t = random_poses(20, seed=5)
+    seen, _ = predict_brick(R, t, CAMERA, brick, collar_mm=0.7)
+    uv = seen.uv_px + np.random.default_rng(5).normal(0, SD_PX, seen.uv_px.shape)
+    uv[3, 2] = np.nan
+    uv[7] = np.nan
+    motion = LedMotion(
+        rvec_brick_rad=np.zeros((20, 7, 3)),
+        shift_camera_mm=np.zeros((20, 7, 3)),
+        dt_s=(uv[..., 1] - 540) * 19e-6,
+        twist_sd=np.tile([0.02, 0.02, 0.02, 5.0, 5.0, 5.0], (20, 1)),
+    )
+    fitted = refine_poses(uv, cov(20, sd=1.0), R, t, CAMERA, brick, collar_mm=0.7, motion=motion)
+    start = (
+        fitted.R_camera_brick @ Rotation.from_rotvec([2e-4, 0, -1e-4]).as_matrix(),
+        t + np.array([0.0, 0.02, 0.05]),
+    )
+    A, g = pose_equations(uv, cov(20, sd=1.0), *start, CAMERA, brick, collar_mm=0.7, motion=motion)
+    assert (A[7] == 0).all() and (g[7] == 0).all()
+    rest = np.delete(np.arange(20), 7)
+    step = np.linalg.solve(A[rest], g[rest][..., None])[..., 0]
+    R_then = start[0][rest] @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+    left = error_of(
+        R_then, start[1][rest] + step[:, 3:], fitted.R_camera_brick[rest], fitted.t_camera_brick_mm[rest]
+    )
+    # One step of Gauss and Newton, about a pose that is not the fit's own.
+    sd = np.sqrt(np.einsum("nii->ni", fitted.covariance[rest]))
+    assert np.abs(left / sd).max() < 0.01
+    np.testing.assert_allclose(np.sqrt(np.einsum("nii->ni", np.linalg.inv(A[rest]))) / sd, 1.0, atol=0.01)

@@ -18,6 +18,7 @@ from bricktrack_host.tracking.led_model.hit_polynomials import hit_polynomials
 from bricktrack_host.tracking.led_model.led_outline import outlines_of
 from bricktrack_host.tracking.led_model.led_profile import shift_per_radius
 from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.reduced_kernel import reduce_frames
 from bricktrack_host.tracking.pose.refine_equations import RATE_PER_TWIST
 from bricktrack_host.tracking.pose.refine_kernel import fit_frames
 from bricktrack_host.tracking.pose.refine_problem import (
@@ -203,6 +204,30 @@ def refine_poses(
         area_px2=out.area,
         facing=out.facing,
     )
+
+
+def pose_equations(
+    uv_px: FloatArray,
+    cov_px2: FloatArray,
+    R: FloatArray,
+    t_mm: FloatArray,
+    ray_model: RayModel,
+    brick_model: BrickModel,
+    *,
+    collar_mm: float | None,
+    motion: LedMotion,
+) -> tuple[FloatArray, FloatArray]:
+    """Return normal matrices, (n, 6, 6), and right sides, (n, 6), of what poses to expand about are off by.
+
+    Profile and twist are taken out of them. Parameters are those of `refine_poses`, steps are ``[dtheta rad,
+    dt mm]`` of `bricktrack_host.tracks`; frames that tell nothing have zeros.
+    """
+    observed = _observed(uv_px, cov_px2, all_finite(uv_px) & all_finite(cov_px2, 2), motion, slice(None))
+    fitted = _started(R, t_mm, uv_px.shape[1])
+    A, g = np.zeros((len(R), 6, 6)), np.zeros((len(R), 6))
+    model = _model(ray_model, brick_model, collar_mm, False)
+    reduce_frames(observed, model, fitted, room_for(uv_px.shape[1]), A, g)
+    return A, g
 
 
 def _by_centroids(with_pose: FloatArray, motion: LedMotion | None) -> FloatArray:
