@@ -62,11 +62,11 @@ def require_dataset(root: Path) -> None:
 def locked(root: Path) -> Iterator[None]:
     """Hold the dataset alone, made if there is none, with what a kill left undone put right."""
     partial = root / f".{MARKER_NAME}.partial"
-    if root.exists() and not (root / MARKER_NAME).is_file() and set(root.iterdir()) - {partial}:
-        raise StorageError(
-            f"{root} exists and holds no {MARKER_NAME}; it is left alone. Choose another folder"
-        )
     with storage_errors(root, "The dataset cannot be written; make room, or choose another folder"):
+        if root.exists() and not (root / MARKER_NAME).is_file() and set(root.iterdir()) - {partial}:
+            raise StorageError(
+                f"{root} exists and holds no {MARKER_NAME}; it is left alone. Choose another folder"
+            )
         root.mkdir(parents=True, exist_ok=True)
         handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY)
     try:

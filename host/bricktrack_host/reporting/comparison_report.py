@@ -33,7 +33,6 @@ def write_comparison_page(
     StorageError
         If it cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_page(path, render_comparison(comparison, progress=progress))
 
 

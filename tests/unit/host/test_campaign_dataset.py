@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.dataset
 import pyarrow.parquet as pq
 import pytest
-from campaign_lab import combine, files_of, make_campaign, make_lab, rows_of
+from campaign_lab import combine, files_of, make_campaign, rows_of
 from small_lab import UNITS
 from typer.testing import CliRunner
 
@@ -26,16 +26,6 @@ from bricktrack_host.datasets.test_sources import source_of_run, sources_of_test
 from bricktrack_host.results.result_store import read_result, write_results
 
 DOCS = Path(__file__).parents[3] / "docs"
-
-
-@pytest.fixture(scope="module")
-def lab(tmp_path_factory):
-    return make_lab(tmp_path_factory.mktemp("lab"))
-
-
-@pytest.fixture(scope="module")
-def campaign(lab, tmp_path_factory):
-    return make_campaign(lab, tmp_path_factory.mktemp("data") / "campaign")
 
 
 def test_rows_seen_from_the_camera_are_those_of_the_run(lab, campaign):

@@ -6,22 +6,12 @@ import sys
 
 import numpy as np
 import pytest
-from campaign_lab import files_of, make_campaign, make_lab, rows_of
+from campaign_lab import files_of, make_campaign, rows_of
 
 from bricktrack_common.errors import RunFormatError, StorageError
 from bricktrack_host.datasets import campaign_dataset, campaign_folder
 from bricktrack_host.datasets.campaign_dataset import add_units, open_dataset
 from bricktrack_host.datasets.test_sources import sources_of_test
-
-
-@pytest.fixture(scope="module")
-def lab(tmp_path_factory):
-    return make_lab(tmp_path_factory.mktemp("lab"))
-
-
-@pytest.fixture(scope="module")
-def campaign(lab, tmp_path_factory):
-    return make_campaign(lab, tmp_path_factory.mktemp("data") / "campaign")
 
 
 @pytest.fixture(scope="module")
@@ -135,3 +125,9 @@ def test_a_folder_of_something_else_and_a_busy_dataset_are_refused(lab, tmp_path
     root = tmp_path / "campaign"
     with campaign_folder.locked(root), pytest.raises(StorageError, match="another command adds"):
         add_units(root, sources_of_test(lab / "shake-12"), whole_tests=True)
+
+
+def test_a_file_where_the_dataset_is_to_be_is_named(tmp_path):
+    (tmp_path / "campaign").touch()
+    with pytest.raises(StorageError, match=r"campaign: Not a directory\..*choose another folder"):
+        campaign_folder.locked(tmp_path / "campaign").__enter__()
