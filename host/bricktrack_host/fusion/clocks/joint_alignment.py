@@ -11,7 +11,7 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.fusion.clocks.rotation_fit import LOSS_PRIOR_SD_S2, MIN_POSES
+from bricktrack_host.fusion.clocks.rotation_fit import DISPERSION_PRIOR_SD_S3, LOSS_PRIOR_SD_S2, MIN_POSES
 from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.fusion.inertial.attitude import Attitude
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
@@ -60,8 +60,8 @@ def align_jointly(
     -----
     ``M_i = A_i R_i B_i^T`` is constant but for slow drift, with the attitude A of the camera and B of the
     brick by their gyros, and R as the camera saw it. Of its error in B's axes an offset takes ``B omega_B``
-    or ``-M^T A omega_A``, and a low-pass that takes c of the second derivative of a rate, minus c times the
-    rate's derivative in their place.
+    or ``-M^T A omega_A``, and a low-pass that takes c of the second derivative of a rate, and d of the third,
+    minus c times the rate's first derivative and d times its second in their place.
     """
     seen = has_pose(optical)
     t_ns, R = optical.t_ns[seen], optical.R_camera_brick[seen]
@@ -70,30 +70,32 @@ def align_jointly(
     inverse_sd = 1 / np.maximum(np.sqrt(variance), MIN_ROTATION_SD_RAD)
     of_brick = _sensor(imu, brick, brick.gyro_bias_radps)
     of_camera = _sensor(camera_imu, camera, camera_bias_radps)
-    filter_s, covariance, residual_sd = 0.0, np.eye(5), float("nan")
+    filter_s, covariance, residual_sd = 0.0, np.eye(6), float("nan")
     has_filter, weight = False, np.ones(len(t_ns))
-    prior = np.diag([0.0, _SKEW_PRIOR_SD**-2, 0.0, _SKEW_PRIOR_SD**-2, LOSS_PRIOR_SD_S2**-2])
+    prior_sd = [np.inf, _SKEW_PRIOR_SD, np.inf, _SKEW_PRIOR_SD, LOSS_PRIOR_SD_S2, DISPERSION_PRIOR_SD_S3]
+    prior = np.diag(np.array(prior_sd) ** -2.0)
     for _ in range(_ROUNDS):
-        B, rate_B, slow_B, in_B = _turned(of_brick, t_ns, since_mid_s, filter_s)
-        A, rate_A, slow_A, in_A = _turned(of_camera, t_ns, since_mid_s, filter_s)
+        B, rates_B, in_B = _turned(of_brick, t_ns, since_mid_s, filter_s)
+        A, rates_A, in_A = _turned(of_camera, t_ns, since_mid_s, filter_s)
         inside = in_A & in_B
         if inside.sum() < MIN_POSES:
             return brick, camera
         M = A @ R @ np.swapaxes(B, 1, 2)
         first = M[np.flatnonzero(inside)[inside.sum() // 2]]
         error = rvec_from_matrix(first.T @ M)
-        rate_A, slow_A = -rate_A @ first, -slow_A @ first
+        (rate_A, slow_A, curve_A), (rate_B, slow_B, curve_B) = -rates_A @ first, rates_B
         column = since_mid_s[:, None]
         design = np.stack(
-            [rate_B, column * rate_B, rate_A, column * rate_A, -(slow_B + slow_A)], axis=2
-        )  # (n, 3, [offset, skew of the brick's, offset, skew of the camera's, c])
+            [rate_B, column * rate_B, rate_A, column * rate_A, -(slow_B + slow_A), -(curve_B + curve_A)],
+            axis=2,
+        )  # (n, 3, [offset, skew of the brick's, offset, skew of the camera's, c, d])
         w = np.where(inside, weight * inverse_sd, 0.0)
         basis = _hats(since_mid_s)
         Q, _ = np.linalg.qr(w[:, None] * basis)
         a, y = w[:, None, None] * design, w[:, None] * error
         a = a - np.einsum("nk,mk,mij->nij", Q, Q, a, optimize=True)
         y = y - Q @ (Q.T @ y)
-        past = np.array([0.0, of_brick.skew, 0.0, of_camera.skew, filter_s**2])
+        past = np.array([0.0, of_brick.skew, 0.0, of_camera.skew, filter_s**2, 0.0])
         normal = np.einsum("nij,nik->jk", a, a) + prior
         step = np.linalg.solve(normal, np.einsum("nij,ni->j", a, y) - prior @ past)
         left = np.linalg.norm(y - a @ step, axis=1)[inside] / np.sqrt(3)
@@ -133,16 +135,13 @@ def _moved(sensor: _Sensor, offset_s: float, skew: float) -> _Sensor:
 
 def _turned(
     sensor: _Sensor, t_ns: IntArray, since_mid_s: FloatArray, filter_s: float
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return attitudes at frames by a gyro, rate and its derivative in still axes, and which are known."""
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return attitudes by a gyro at frames, rate and two derivatives in still axes, and which are known."""
     signal = ImuSignal.from_track(sensor.imu, gyro_filter_s=filter_s)
     at_s = seconds_since(t_ns, signal.epoch_ns) + sensor.offset_s + sensor.skew * since_mid_s
     R = Attitude(signal, sensor.bias_radps).at(at_s)
-    rate, slow = (
-        np.einsum("nij,nj->ni", R, v)
-        for v in (signal.gyro_at(at_s) - sensor.bias_radps, signal.gyro_rate_at(at_s))
-    )
-    return R, rate, slow, np.asarray(~signal.in_gap(at_s))
+    rates = np.stack([signal.gyro_at(at_s) - sensor.bias_radps, *signal.gyro_derivatives_at(at_s)])
+    return R, np.einsum("nij,dnj->dni", R, rates), np.asarray(~signal.in_gap(at_s))
 
 
 def _hats(t_s: FloatArray) -> FloatArray:

@@ -11,6 +11,8 @@ from bricktrack_host.compiled import compiled
 from bricktrack_host.fusion.inertial.rotation_kernel import turn_by, write_rotation_vector
 from bricktrack_host.fusion.inertial.signal_kernel import GyroPieces, held_value, piece_of
 
+N_COLUMNS = 4
+"""Of the least squares: offset, skew, and the low-pass's c and d."""
 _RIDGE = 1e-12  # of the largest knot: one without frames is held at zero
 
 
@@ -62,16 +64,17 @@ def compare_with_gyro(
     -------
     attitude, error : ndarray, shape (n, 3, 3), (n, 3)
         The error in the axes of the gyro's start: constant but for its drift.
-    design : ndarray, shape (n, 3, 3)
-        Columns: derivative of the error by offset, by skew, and by the low-pass: that takes c times its
-        second derivative from the rate, and so c times its first from the angle.
+    design : ndarray, shape (n, 3, 4)
+        Columns: derivative of the error by offset, by skew, and by the low-pass: beside its delay, that takes
+        c times the second derivative from the rate and d times the third, and so from the angle c times the
+        rate's first derivative and d times its second.
     """
     n_frames = len(t_imu_s)
     attitude, error = np.empty((n_frames, 3, 3)), np.empty((n_frames, 3))
-    design = np.empty((n_frames, 3, 3))
+    design = np.empty((n_frames, 3, N_COLUMNS))
     reference, predicted, turn = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     low, high = pieces.span_s
-    rate, slope = np.empty(3), np.empty(3)
+    rate, slope, curve = np.empty(3), np.empty(3), np.empty(3)
     i, node = 0, 0
     for n in range(n_frames):
         t = t_imu_s[n]
@@ -87,6 +90,7 @@ def compare_with_gyro(
             c = pieces.gyro[:, i, a]
             rate[a] = ((c[0] * s + c[1]) * s + c[2]) * s + c[3] - bias_radps[a]
             slope[a] = (3.0 * c[0] * s + 2.0 * c[1]) * s + c[2]
+            curve[a] = 6.0 * c[0] * s + 2.0 * c[1]
         A = attitude[n]
         A[:] = node_attitude[node]
         turn_by(A, turn)
@@ -105,6 +109,7 @@ def compare_with_gyro(
             design[n, a, 0] = A[a, 0] * rate[0] + A[a, 1] * rate[1] + A[a, 2] * rate[2]
             design[n, a, 1] = since_mid_s[n] * design[n, a, 0]
             design[n, a, 2] = -(A[a, 0] * slope[0] + A[a, 1] * slope[1] + A[a, 2] * slope[2])
+            design[n, a, 3] = -(A[a, 0] * curve[0] + A[a, 1] * curve[1] + A[a, 2] * curve[2])
     return attitude, error, design
 
 
@@ -172,21 +177,23 @@ def normal_equations(
     design: FloatArray,
     error: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return normal matrix (3, 3) and right side (3,) of error = design @ step + drift, drift eliminated."""
+    """Return normal matrix (4, 4) and right side (4,) of error = design @ step + drift, drift eliminated."""
     n_frames = len(knot)
-    columns = np.empty((n_frames, 12))  # axis by axis: design and error
+    n_each = N_COLUMNS + 1
+    columns = np.empty((n_frames, 3 * n_each))  # axis by axis: design and error
     for n in range(n_frames):
         for a in range(3):
-            for c in range(3):
-                columns[n, 4 * a + c] = design[n, a, c]
-            columns[n, 4 * a + 3] = error[n, a]
+            for c in range(N_COLUMNS):
+                columns[n, n_each * a + c] = design[n, a, c]
+            columns[n, n_each * a + N_COLUMNS] = error[n, a]
     columns -= drift_of(weight, knot, share, n_knots, columns)
-    normal, right = np.zeros((3, 3)), np.zeros(3)
+    normal, right = np.zeros((N_COLUMNS, N_COLUMNS)), np.zeros(N_COLUMNS)
     for n in range(n_frames):
         w = weight[n] * weight[n]
         for a in range(3):
-            for c in range(3):
-                right[c] += w * columns[n, 4 * a + c] * columns[n, 4 * a + 3]
-                for d in range(3):
-                    normal[c, d] += w * columns[n, 4 * a + c] * columns[n, 4 * a + d]
+            i = n_each * a
+            for c in range(N_COLUMNS):
+                right[c] += w * columns[n, i + c] * columns[n, i + N_COLUMNS]
+                for d in range(N_COLUMNS):
+                    normal[c, d] += w * columns[n, i + c] * columns[n, i + d]
     return normal, right

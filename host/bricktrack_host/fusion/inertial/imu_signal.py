@@ -201,9 +201,10 @@ class ImuSignal:
         """Return the measured specific force, m/s^2; held beyond the first and last sample."""
         return np.asarray(self._acc.spline(self._held(t_s)))
 
-    def gyro_rate_at(self, t_s: FloatArray) -> FloatArray:
-        """Return how fast the measured angular rate changes, rad/s^2."""
-        return np.asarray(self._gyro.spline(self._held(t_s), 1))
+    def gyro_derivatives_at(self, t_s: FloatArray) -> FloatArray:
+        """Return the first and second derivative of the measured angular rate, rad/s^2 and rad/s^3."""
+        held = self._held(t_s)
+        return np.stack([self._gyro.spline(held, order) for order in (1, 2)])
 
     def angle_at(self, t_s: FloatArray) -> FloatArray:
         """Return the integral of the measured angular rate, component by component, rad."""
