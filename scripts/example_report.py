@@ -25,6 +25,7 @@ from bricktrack_common.run_manifest import (
 )
 from bricktrack_host.evaluation.paper_brick import paper_brick
 from bricktrack_host.quality import LedFlag, PoseFlag
+from bricktrack_host.reporting.page_picture import page_picture
 from bricktrack_host.reporting.plots import CalibrationPicture, FrameOverlay
 from bricktrack_host.reporting.report import ReportExtras, write_report
 from bricktrack_host.results.daq_clock import fit_edges
@@ -297,7 +298,7 @@ def example_extras(result: RunResult, seed: int = 2) -> ReportExtras:
         overlays.append(
             FrameOverlay(
                 title=f"frame {i}",
-                image=np.clip(image, 0, 255).astype(np.uint8),
+                picture=page_picture(np.clip(image, 0, 255).astype(np.uint8)),
                 detected_uv_px=seen,
                 predicted_uv_px=seen - np.nan_to_num(result.optical.residual_px[i]),
             )

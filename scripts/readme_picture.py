@@ -6,7 +6,9 @@ python scripts/readme_picture.py RESULTS_FOLDER TRUTH OUTPUT.png
 import sys
 from pathlib import Path
 
+import cv2
 import motion_and_error
+import numpy as np
 from matplotlib.figure import Figure
 
 from bricktrack_host.quality import LedFlag
@@ -23,6 +25,7 @@ def main() -> None:
     result = read_result(folder)
     comparison = compare_with_truth(result, read_true_motion(truth))
     overlay = load_pictures(folder / PICTURES_NAME)[0][1]
+    photo = overlay.picture
     fused, rest, t0 = result.fused["edge"], result.rest, result.t0_ns
     if rest is None or t0 is None:
         sys.exit(f"{folder}: no rest pose or no trigger")
@@ -30,7 +33,9 @@ def main() -> None:
     figure = Figure(figsize=(11.5, 4.6), layout="constrained")
     left, right = figure.subfigures(1, 2, width_ratios=(1, 1.25))
     picture = left.add_subplot()
-    picture.imshow(overlay.image, cmap="gray", vmin=0, vmax=255)
+    image = cv2.imdecode(np.frombuffer(photo.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    extent = (-0.5, photo.width_px - 0.5, photo.height_px - 0.5, -0.5)
+    picture.imshow(image, cmap="gray", vmin=0, vmax=255, extent=extent)
     picture.plot(*overlay.detected_uv_px.T, "+", color="#ffb703", ms=9, mew=1.4)
     picture.set_title("one frame, simulated, and the LEDs found in it", fontsize=10)
     picture.set_axis_off()

@@ -6,7 +6,6 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray
@@ -15,9 +14,6 @@ from bricktrack_host.reporting.plots import FrameOverlay
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_PICTURE_WIDTH_PX = 960  # more than a page shows of it
-_JPEG_QUALITY = 88
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +40,8 @@ def embed_figure(figure: "Figure", alt: str, caption: str = "", *, half: bool = 
 
 def embed_overlay(overlay: FrameOverlay) -> EmbeddedFigure:
     """Return a decoded frame with rings where LEDs were seen and crosses where the pose puts them."""
-    rows, columns = overlay.image.shape[:2]
-    scale = min(1.0, _PICTURE_WIDTH_PX / columns)
-    small = cv2.resize(overlay.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    if small.ndim == 3:
-        small = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
-    _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    photo = base64.b64encode(jpeg.tobytes()).decode()
+    rows, columns = overlay.picture.height_px, overlay.picture.width_px
+    photo = base64.b64encode(overlay.picture.jpeg).decode()
     unit = columns / 400  # marks are of a size on the page, whatever the picture's
     rings = "".join(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{7 * unit:.1f}"/>'
                     for u, v in _known(overlay.detected_uv_px))  # fmt: skip

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
@@ -13,6 +12,7 @@ from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting.chart import INK as INK
 from bricktrack_host.reporting.chart import Chart, Panel, panel_grid
 from bricktrack_host.reporting.chart_marks import Instants, Line, Scatter, Spans, band
+from bricktrack_host.reporting.page_picture import PagePicture
 from bricktrack_host.reporting.thinning import thinned, thinned_band
 from bricktrack_host.results.rest_pose import FromRest
 from bricktrack_host.results.result_store import RunResult
@@ -67,13 +67,13 @@ class FrameOverlay:
     Attributes
     ----------
     title : str
-    image : ndarray of uint8, shape (rows, columns) grey or (rows, columns, 3) RGB
+    picture : PagePicture
     detected_uv_px, predicted_uv_px : ndarray, shape (n, 2), px
-        NaN where there is none.
+        In the camera's picture; NaN where there is none.
     """
 
     title: str
-    image: NDArray[np.uint8]
+    picture: PagePicture
     detected_uv_px: FloatArray
     predicted_uv_px: FloatArray
 

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 
 from bricktrack_common.errors import RunFormatError, StorageError
+from bricktrack_host.reporting.page_picture import PagePicture, page_picture
 from bricktrack_host.reporting.plots import CalibrationPicture, FrameOverlay
 
 PICTURES_NAME = "pictures.npz"
-_JPEG_QUALITY = 90
 
 
 def save_pictures(path: Path, overlays: Sequence[FrameOverlay], calibration: CalibrationPicture) -> None:
-    """Write overlays (frames as JPEG) and the calibration's outline to one file.
+    """Write overlays and the calibration's outline to one file.
 
     Raises
     ------
@@ -30,10 +30,9 @@ def save_pictures(path: Path, overlays: Sequence[FrameOverlay], calibration: Cal
     for i, outline in enumerate(calibration.covered_uv_px):
         values[f"outline_{i}"] = outline
     for i, o in enumerate(overlays):
-        _, jpeg = cv2.imencode(".jpg", o.image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-        values[f"jpeg_{i}"], values[f"detected_{i}"], values[f"predicted_{i}"] = (
-            jpeg, o.detected_uv_px, o.predicted_uv_px,
-        )  # fmt: skip
+        values[f"jpeg_{i}"] = np.frombuffer(o.picture.jpeg, dtype=np.uint8)
+        values[f"of_px_{i}"] = np.array([o.picture.width_px, o.picture.height_px])
+        values[f"detected_{i}"], values[f"predicted_{i}"] = o.detected_uv_px, o.predicted_uv_px
     try:
         np.savez(path, allow_pickle=False, **values)
     except OSError as e:
@@ -57,8 +56,11 @@ def load_pictures(path: Path) -> tuple[list[FrameOverlay], CalibrationPicture | 
                 image = cv2.imdecode(file[f"jpeg_{i}"], cv2.IMREAD_GRAYSCALE)
                 if image is None:
                     raise RunFormatError(f"{path}: picture {i} is no JPEG. Process the run again")
-                grey = np.asarray(image, dtype=np.uint8)
-                overlays.append(FrameOverlay(title, grey, file[f"detected_{i}"], file[f"predicted_{i}"]))
+                if f"of_px_{i}" in file:
+                    picture = PagePicture(file[f"jpeg_{i}"].tobytes(), *file[f"of_px_{i}"].tolist())
+                else:  # of before they were shrunk to be kept
+                    picture = page_picture(np.asarray(image, dtype=np.uint8))
+                overlays.append(FrameOverlay(title, picture, file[f"detected_{i}"], file[f"predicted_{i}"]))
             width, height = file["size_px"].tolist()
             outlines = [file[f"outline_{i}"] for i in range(int(file["n_outlines"]))]
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:

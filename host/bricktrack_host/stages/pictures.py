@@ -11,9 +11,10 @@ from bricktrack_common.frame_times import FrameTimes
 from bricktrack_common.run_folder import Run
 from bricktrack_host.recordings.video_frames import DecodedFrame
 from bricktrack_host.recordings.video_parts import work_on_frames
+from bricktrack_host.reporting.page_picture import PagePicture, page_picture
 from bricktrack_host.stages.progress import ProcessProgress, Silent
 from bricktrack_host.tracking.pictures.run_lights import light_finder
-from bricktrack_host.tracking.pictures.segment import Blobs, Plane
+from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracks import LedObservations, OpticalTrack
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class RunPictures:
         self._video = run.video
         self._frames = frames
         self._keep = set(np.linspace(0, frames.n_frames - 1, _N_OVERLAYS).round().astype(int).tolist())
-        self._kept: dict[int, Plane] = {}
+        self._kept: dict[int, PagePicture] = {}
         self._lost: dict[str, list[int]] = {}
 
     def observe(
@@ -67,7 +68,7 @@ class RunPictures:
             if frame.picture is None:
                 return frame.lost_because
             if frame.index in self._keep:
-                self._kept[frame.index] = frame.picture.luma.copy()
+                self._kept[frame.index] = page_picture(frame.picture.luma)
             return find(frame.index, frame.picture)
 
         found = work_on_frames(self._video, self._frames, lights_of, progress=progress.advance_to)
@@ -100,10 +101,10 @@ class RunPictures:
         from bricktrack_host.reporting.plots import FrameOverlay
 
         out = []
-        for i, luma in sorted(self._kept.items()):
+        for i, picture in sorted(self._kept.items()):
             predicted = observations.uv_px[i] - optical.residual_px[i]
             seconds = (optical.t_ns[i] - optical.t_ns[0]) / 1e9
-            out.append(FrameOverlay(f"frame {i}, {seconds:.2f} s", luma, observations.uv_px[i], predicted))
+            out.append(FrameOverlay(f"frame {i}, {seconds:.2f} s", picture, observations.uv_px[i], predicted))
         return out
 
 

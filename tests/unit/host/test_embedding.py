@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bricktrack_host.reporting.embedding import embed_overlay
+from bricktrack_host.reporting.page_picture import page_picture
 from bricktrack_host.reporting.plots import FrameOverlay
 
 
@@ -21,7 +22,7 @@ def test_overlay_marks_are_at_their_pixels_over_the_whole_picture(shape):
     image = np.zeros(shape, np.uint8)
     image[10:20, 30:40] = 250
     overlay = FrameOverlay(
-        "frame 3, 0.1 s & more", image,
+        "frame 3, 0.1 s & more", page_picture(image),
         np.array([[34.5, 14.5], [np.nan, np.nan]]), np.array([[35.0, 15.0], [100.0, 60.0]]),
     )  # fmt: skip
     embedded = embed_overlay(overlay)

@@ -182,8 +182,8 @@ def test_write_replaces_the_file_whole_and_says_why_it_cannot(result, tmp_path, 
     monkeypatch.setattr("bricktrack_host.reporting.report.render_report", lambda *_: "<html>")
     write_report(result, tmp_path / "report.html")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
-    with pytest.raises(StorageError, match="cannot be written"):
-        write_report(result, tmp_path / "no" / "report.html")
+    with pytest.raises(StorageError, match="cannot be written"):  # there, a file is in the way
+        write_report(result, tmp_path / "report.html" / "report.html")
 
 
 def test_flags_of_the_whole_run_become_words(result):
