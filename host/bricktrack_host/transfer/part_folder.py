@@ -311,3 +311,8 @@ def _parse_range(line: bytes) -> _Range | None:
         return msgspec.json.decode(line, type=_Range)
     except (msgspec.DecodeError, UnicodeDecodeError):
         return None
+
+
+# As in `bricktrack_common.wire_codec`: not when the threads of several pulls come here at once.
+for _line in (_Head, _Range):
+    msgspec.json.Decoder(_line)
