@@ -16,34 +16,25 @@ import numpy as np
 from scipy.special import gammaln
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of, with_rows
+from bricktrack_host.tracking.identity.evidence_kernel import Placed, log_area_odds, log_areas, log_places
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.refine import OWN_SHARE
 
 _FLOOR_PX = 0.05  # calibration and rendering leave this at least
 _CUT_SD_RADII = 0.3  # what is left of an LED that a border or a card cuts has its centroid elsewhere
-_MISPLACED_RADII = {True: (0.0, 0.01, 0.04), False: (0.003, 0.01, 0.04)}
-"""Centroids are off by so much more, in LED radii, by whether the profile was fitted: as usual, and where
-codec, glare, lens, or a profile that no collar describes, do worse."""
-_MISPLACED_SHARE = {True: (0.8, 0.15, 0.05), False: (0.5, 0.3, 0.2)}
-_SPEEDS = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0])
-"""Shares of what is not known of the motion that the brick may move at: at rest, or at any speed alike."""
-_AT_REST = 0.5
-_AREA_SDS = np.array([0.03, 0.1, 0.2])
-"""Of the logarithm of an LED's area over the predicted one, in one picture, alike likely: clean ones leave
-0.01, glare, limb darkening and the profile more."""
-_AREA_OTHER = 0.05  # share of LEDs whose area says nothing: partly covered, run together with another light
-_LOG_AREAS = np.log(81.0)  # of other lights: what segmentation lets pass is a third to three times the radius
+_MISPLACED = {
+    True: np.array([[0.0, 0.8], [0.01, 0.15], [0.04, 0.05]]),
+    False: np.array([[0.003, 0.5], [0.01, 0.3], [0.04, 0.2]]),
+}
+"""Centroids are off by so much more, in LED radii, in such shares of pictures, by whether the profile was
+fitted: as usual, and where codec, glare, lens, or a profile that no collar describes, do worse."""
 _SCATTERED = 2.0  # chi-square of so many times its freedom: one in ten at four, one in fifteen at six
-_COMMON_AREA_SD = 0.25  # of the logarithm of the factor that all areas share
-_COMMON_AREA = 0.5  # limit of the logarithm of the factor that all areas share
 _HIDDEN = 0.2  # share of LEDs facing the camera that show no light
 _FALSE = 5.0  # false lights to be expected in a picture, the more the less likely
 _TURNED_TO_CAMERA = 8.0
 """By how much likelier, as a logarithm, all LEDs facing the camera are than none: layouts are made for it.
 With axes 45 degrees about their mean, half of all pictures show a brick within 30 degrees of facing the
 camera, nineteen in twenty within 60."""
-_PRIOR = np.diag([0.1, 0.1, 0.1, 4e-4, 4e-4, 4e-4, 1.0])
-"""Inverse variances of turn, rad, and shift, mm, about the fitted pose, both wide, and of the profile."""
 _DEPTHS = 2.6  # integral of (z / z0)^2 from half the distance to twice that: where bricks may be
 
 
@@ -208,90 +199,24 @@ def _of_lights(
     given: Given, shown: Shown, kept: BoolArray, is_fitted: bool, turned: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the logarithm of the density of lights, the pose's taken as one, and the chi-square at rest."""
-    radius2 = np.where(kept, shown.area_px2 / np.pi, 1.0)
+    radius2 = shown.area_px2 / np.pi
     own2 = OWN_SHARE**2 * (shown.profile_px**2).sum(axis=-1) if is_fitted else 0.0
     extra = _FLOOR_PX**2 + own2 + np.where(given.is_whole, 0.0, _CUT_SD_RADII**2 * radius2)
-    extra = np.where(kept, extra, 0.0)
-    residual = given.uv_px - shown.uv_px
-    X = np.concatenate([shown.J_px_per_pose, shown.profile_px[..., None], residual[..., None]], axis=-1)
-    X = np.where(kept[..., None, None], X, 0.0)
-    per_twist = np.where(kept, given.dt_s, 0.0)[..., None, None] * given.twist_sd[:, None, None]
-    X = np.concatenate([X[..., :7], X[..., :6] * per_twist, X[..., 7:]], axis=-1)
-    cov = np.where(kept[..., None, None], given.cov_px2, np.eye(2))
-    J_tilt, tilt = shown.J_tilt_per_turn, shown.tilt
-    X_tilt = np.zeros((len(kept), 3, X.shape[-1]))
-    X_tilt[..., :3], X_tilt[..., -1] = J_tilt, -tilt  # what is left of it, as the residual of the lights
-    by_tilt = turned * np.swapaxes(X_tilt, -1, -2) @ X_tilt
-    log_density, chi2 = [], []
-    for share, radii in zip(_MISPLACED_SHARE[is_fitted], _MISPLACED_RADII[is_fitted], strict=True):
-        by_speed, at_rest = _by_speed(
-            X, cov + (extra + radii**2 * radius2)[..., None, None] * np.eye(2), kept, by_tilt
-        )
-        log_density.append(np.log(share) + by_speed)
-        chi2.append(at_rest - turned * (tilt**2).sum(axis=-1))
-    shares = np.full(len(_SPEEDS), (1 - _AT_REST) / (len(_SPEEDS) - 1))
-    shares[0] = _AT_REST
-    places = np.logaddexp.reduce(np.logaddexp.reduce(log_density, axis=0) + np.log(shares), axis=1)
-    return places + _of_areas(given.area_px2, shown.area_px2, kept & given.is_whole), chi2[0]
-
-
-def _by_speed(
-    X: FloatArray, S: FloatArray, kept: BoolArray, by_tilt: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return logarithms of densities, (n, speeds), and the chi-square at rest, (n,).
-
-    Parameters
-    ----------
-    X : ndarray, shape (n, n_leds, 2, 14), px
-        By pose, profile and motion (the latter two per standard deviation), and the residual itself; zero for
-        LEDs without a light.
-    S : ndarray, shape (n, n_leds, 2, 2), px^2
-        Of the lights.
-    """
-    det = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
-    W = (
-        np.stack([S[..., 1, 1], -S[..., 0, 1], -S[..., 1, 0], S[..., 0, 0]], axis=-1).reshape(S.shape)
-        / det[..., None, None]
+    placed = Placed(
+        kept=kept,
+        residual=given.uv_px - shown.uv_px,
+        cov=given.cov_px2 + extra[..., None, None] * np.eye(2),
+        J=shown.J_px_per_pose,
+        profile=shown.profile_px,
+        dt_s=given.dt_s,
+        twist_sd=given.twist_sd,
+        radius2=radius2,
+        tilt=shown.tilt,
+        J_tilt=shown.J_tilt_per_turn,
+        turned=turned,
     )
-    n, n_leds = kept.shape
-    flat = X.reshape(n, 2 * n_leds, X.shape[-1])
-    weighted = (W @ X).reshape(flat.shape)
-    M = np.swapaxes(flat, -1, -2) @ weighted + by_tilt
-    A = M[:, :7, :7] + _PRIOR
-    back = np.linalg.solve(A, M[:, :7, 7:])
-    left = M[:, 7:, 7:] - M[:, 7:, :7] @ back  # what pose and profile do not explain
-    at_rest = left[:, 6, 6]
-    size, axes = np.linalg.eigh(left[:, :6, :6])
-    pull2 = np.einsum("nij,ni->nj", axes, left[:, :6, 6]) ** 2
-    spread = 1 + _SPEEDS[:, None] ** 2 * np.maximum(size, 0.0)[:, None]
-    explained = (_SPEEDS[:, None] ** 2 * pull2[:, None] / spread).sum(axis=-1)
-    by_motion = 0.5 * (explained - np.log(spread).sum(axis=-1))
-    n_kept = kept.sum(axis=1)
-    of_lights = np.where(kept, np.log(det), 0.0).sum(axis=1) + np.linalg.slogdet(A)[1] + at_rest
-    rest = (3 - n_kept) * np.log(2 * np.pi) - 0.5 * of_lights
-    return rest[:, None] + by_motion, at_rest
-
-
-def _of_areas(area_px2: FloatArray, predicted_px2: FloatArray, kept: BoolArray) -> FloatArray:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = np.log(area_px2 / predicted_px2)
-    known = kept & np.isfinite(ratio)
-    ratio = np.where(known, ratio, 0.0)
-    n = np.maximum(known.sum(axis=1), 1)
-    # The median of those known, the others at infinity: a covered LED does not shift it.
-    ordered = np.sort(np.where(known, ratio, np.inf), axis=1)
-    rows = np.arange(len(ratio))
-    common = 0.5 * (ordered[rows, (n - 1) // 2] + ordered[rows, n // 2])
-    common = np.clip(np.where(known.any(axis=1), common, 0.0), -_COMMON_AREA, _COMMON_AREA)
-    gain = np.where(known[..., None], _of_area(ratio - common[:, None]), 0.0).sum(axis=1)
-    gain = np.logaddexp.reduce(gain, axis=1) - np.log(len(_AREA_SDS))
-    return np.asarray(gain - 0.5 * (common / _COMMON_AREA_SD) ** 2)
-
-
-def _of_area(log_ratio: FloatArray) -> FloatArray:
-    """Return what an LED's area says by each scatter of areas, (..., scatters)."""
-    own = np.exp(-0.5 * (log_ratio[..., None] / _AREA_SDS) ** 2) / (np.sqrt(2 * np.pi) * _AREA_SDS)
-    return np.asarray(np.log((1 - _AREA_OTHER) * own * _LOG_AREAS + _AREA_OTHER))
+    places, chi2 = log_places(placed, _MISPLACED[is_fitted])
+    return places + log_areas(given.area_px2, shown.area_px2, kept & given.is_whole), chi2
 
 
 def log_area_ratio(log_ratio: FloatArray) -> FloatArray:
@@ -299,8 +224,8 @@ def log_area_ratio(log_ratio: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    log_ratio : ndarray
+    log_ratio : ndarray, shape (n,)
         Logarithm of the area over the predicted one, less what all LEDs of the picture have in common; NaN
         where one is not known, and in what is returned.
     """
-    return np.asarray(np.log(np.exp(_of_area(log_ratio)).mean(axis=-1)))
+    return log_area_odds(log_ratio)
