@@ -1,7 +1,8 @@
 """From the pictures of a run to identified centroids.
 
 The lights of all pictures (`run_lights`) are identified (`led_identity`), and their areas compared with what
-each LED shows in the rest of the run: LEDs partly covered, or run together with another light, are flagged.
+each LED shows in the rest of the run: LEDs partly covered, or run together with another light, are flagged,
+and those that something only begins to touch doubted (`led_shapes`).
 """
 
 import logging
@@ -19,6 +20,7 @@ from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS
 from bricktrack_host.tracking.identity.led_identity import SegmentMethod, identify_run
 from bricktrack_host.tracking.identity.run_identities import Identities
 from bricktrack_host.tracking.led_model.led_profile import LedPrediction, collar_of, predict_brick
+from bricktrack_host.tracking.led_shapes import doubt_by_shape
 from bricktrack_host.tracking.pictures.run_lights import find_run_lights, usual_radius_px
 from bricktrack_host.tracking.pictures.segment import Blobs, Picture
 from bricktrack_host.tracking.pose.finite import all_finite
@@ -165,7 +167,10 @@ def _frame_flags(found: Identities, i: int) -> int:
 def _flag_areas(
     out: LedObservations, R: FloatArray, t: FloatArray, ray_model: RayModel, brick_model: BrickModel
 ) -> None:
-    """Flag LEDs whose area is not what they show in the rest of the run, given the pose."""
+    """Flag LEDs whose area is not what they show in the rest of the run, given the pose.
+
+    Those that are whole, but look other than they do from there, are doubted by as much.
+    """
     posed = np.flatnonzero(all_finite(R, 2))
     if posed.size == 0:
         return
@@ -191,6 +196,10 @@ def _flag_areas(
         flags[deviation < -limit] |= LedFlag.PARTLY_COVERED
         flags[deviation > 2 * limit] |= LedFlag.MERGED
     out.led_flags[posed] = flags
+    whole = usable & ((flags & NOT_USED) == 0)
+    doubt = doubt_by_shape(ratio, out.cov_px2[posed], whole, R[posed], t[posed])
+    doubt_px2 = doubt**2 * out.area_px2[posed] / np.pi
+    out.cov_px2[posed] += np.where(whole, doubt_px2, 0.0)[..., None, None] * np.eye(2)
 
 
 def _relative_misfit(uv_px: FloatArray, prediction: LedPrediction) -> FloatArray:
