@@ -1,6 +1,6 @@
 """Judge how well the clocks of camera and IMU are found, beside the least that could be known of them.
 
-The windows and their recipe are those of ``bench_fusion.py`` (BROAD, CC BY 4.0; simulated camera noise and
+The windows and their recipe are those of ``broad_windows.py`` (BROAD, CC BY 4.0; simulated camera noise and
 clocks). For each window: the error of the offset, its mean and scatter over the seeds, and two limits.
 
 - *bound*: the sd that no unbiased estimate can beat (Cramer and Rao), from the sensitivity of all poses that
@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from bench_fusion import LEVER_ARM_MM, Case, Recipe, make_case
+from broad_windows import LEVER_ARM_MM, Case, Recipe, make_case
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table

@@ -1,6 +1,5 @@
 """A test day by its commands on light units: what each says and leaves, also where something went wrong."""
 
-import importlib.util
 import re
 import subprocess
 import sys
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from example_report import example_result
 from light_fleet import LightFleet, write_fleet_file
 from typer.testing import CliRunner
 
@@ -21,10 +21,6 @@ from bricktrack_host.results.result_store import write_results
 from bricktrack_host.transfer.unit_client import UnitClient
 
 ROOT = Path(__file__).parents[2]
-spec = importlib.util.spec_from_file_location("example_report", ROOT / "scripts" / "example_report.py")
-example = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(example)
-
 NAMES = ["b7-1", "b7-2", "b8-1"]
 
 
@@ -38,7 +34,7 @@ def lab(tmp_path, monkeypatch):
     """Three light units, a fleet file that names them, and processing that writes invented results at once."""
 
     def process(runs, *, fleet, where):
-        blank = example.example_result()
+        blank = example_result()
         for run in runs:
             manifest = read_manifest(run / MANIFEST_NAME)
             named = msgspec.structs.replace(blank.manifest, unit=manifest.unit, run_id=manifest.run_id)

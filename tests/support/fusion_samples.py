@@ -1,30 +1,12 @@
 """The recorded and path-traced fusion samples as tracks."""
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_quaternion, matrix_from_rvec
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
-
-REPOSITORY = Path(__file__).parents[2]
-
-
-def bench_module() -> ModuleType:
-    """Return scripts/bench_fusion.py as a module: it holds the recipe of the recorded windows."""
-    name = "bench_fusion"
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, REPOSITORY / "scripts" / "bench_fusion.py")
-        if spec is None or spec.loader is None:
-            raise ImportError("scripts/bench_fusion.py cannot be loaded")
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module
-        spec.loader.exec_module(module)
-    return sys.modules[name]
 
 
 def path_traced_tracks(folder: Path, *, seed: int) -> tuple[OpticalTrack, ImuTrack]:

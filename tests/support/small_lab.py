@@ -1,10 +1,9 @@
 """A laboratory of two units whose runs are invented (simulated), processed, and of one brick in three parts."""
 
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
+import example_report as example
 import msgspec
 
 from bricktrack_common.run_manifest import MANIFEST_NAME, write_manifest
@@ -61,19 +60,6 @@ leds_on = "C"
 position_brick_layout_mm = [-10.0, 20.0, 30.0]
 """
 """The same brick in a fleet file."""
-
-
-def _example() -> ModuleType:
-    path = Path(__file__).parents[2] / "scripts" / "example_report.py"
-    spec = importlib.util.spec_from_file_location("example_report", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-example = _example()
 
 
 def invented_run(folder: Path, unit: str) -> RunResult:

@@ -1,11 +1,10 @@
 """Components against their base: hand-worked poses, chains, loops and honest covariances."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from example_report import example_result
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.assemblies.component_motion import AssemblyError, assembly_motion
@@ -15,18 +14,12 @@ from bricktrack_host.results.rest_pose import RestPose
 from bricktrack_host.tracks import FusedTrack
 from bricktrack_host.transfer.assembly_config import AssemblyConfig, Component, View
 
-spec = importlib.util.spec_from_file_location(
-    "example_report", Path(__file__).parents[3] / "scripts" / "example_report.py"
-)
-example = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(example)
-
 N = 40
 
 
 @pytest.fixture(scope="module")
 def blank():
-    return example.example_result()
+    return example_result()
 
 
 def homogeneous(rotvec_deg, t_mm):

@@ -1,19 +1,18 @@
-"""How the fusion benchmark makes its cases, and its reference."""
+"""How the fusion benchmark makes its cases, and what stands beside it."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from brick_shakes import LEVER_ARM_MM, simulate_shake
-from fusion_samples import REPOSITORY, bench_module
+from broad_windows import Recipe, cleaned_reference, make_case
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 
 
 def test_the_references_own_errors_are_taken_out_by_the_inertial_unit():
-    rng, bench = np.random.default_rng(2), bench_module()
+    rng = np.random.default_rng(2)
     t = np.arange(4300) / 285.7
     # About one axis the attitude is the integral of the rate, in closed form; the sensor goes round an ellipse.
     axis, w = np.array([0.6, 0.0, 0.8]), 2 * np.pi * 1.3
@@ -22,7 +21,7 @@ def test_the_references_own_errors_are_taken_out_by_the_inertial_unit():
     sensor_m = np.stack([0.02 * np.sin(w * t), 0.01 * np.cos(w * t), 0.0 * t], axis=1)
     force = body.inv().apply(-(w**2) * sensor_m + [0, 0, 9.81])
     noise_rad, noise_m = rng.normal(0, 1e-3, (t.size, 3)), rng.normal(0, 5e-5, (t.size, 3))
-    clean, clean_m = bench.cleaned_reference(
+    clean, clean_m = cleaned_reference(
         t, body * Rotation.from_rotvec(noise_rad), sensor_m + noise_m,
         t_gyro=t, gyro=1.01 * rate + 0.004, t_acc=t, acc=1.01 * force + 0.1,
     )  # fmt: skip
@@ -36,23 +35,22 @@ def test_the_references_own_errors_are_taken_out_by_the_inertial_unit():
 
 
 def test_a_range_is_set_by_the_share_of_samples_beyond_it(tmp_path):
-    rng, bench = np.random.default_rng(3), bench_module()
+    rng = np.random.default_rng(3)
     t = np.arange(-0.5, 15.5, 0.0035)
     acc = np.array([0.0, 0.0, 9.8]) + rng.normal(0, 3, (t.size, 3))
     np.savez(
         tmp_path / "dev_made.npz", t_mocap=t, p=np.zeros((t.size, 3)), t_gyro=t, gyro=np.zeros((t.size, 3)),
         q_xyzw=np.broadcast_to([0, 0, 0, 1.0], (t.size, 4)), t_acc=t, acc=acc, imu_in_opt_m=np.zeros(3),
     )  # fmt: skip
-    case = bench.make_case(tmp_path / "dev_made.npz", seed=0, recipe=bench.Recipe(clip_share=0.05))
+    case = make_case(tmp_path / "dev_made.npz", seed=0, recipe=Recipe(clip_share=0.05))
     at_limit = (np.abs(case.imu.acc_mps2) >= case.imu.acc_range_mps2 - 1e-9).any(axis=1)
     # The limit itself is the sample at that quantile; steps of 0.01 m/s^2 put few others on it.
     assert at_limit.mean() == pytest.approx(0.05, abs=0.005)
     assert np.abs(case.imu.acc_mps2).max() <= case.imu.acc_range_mps2 < 20
 
 
-def test_gtsam_finds_the_motion_of_a_simulated_shake(monkeypatch):
+def test_gtsam_finds_the_motion_of_a_simulated_shake():
     pytest.importorskip("gtsam")
-    monkeypatch.setattr(sys, "path", [*sys.path, str(REPOSITORY / "scripts")])
     from oracle_gtsam import gtsam_poses
 
     s = simulate_shake(9, duration_s=1.5, dropouts=((0.7, 0.85),))

@@ -1,12 +1,11 @@
 """A missed first edge on one unit of a test is found, or said to be unknowable; never guessed."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from example_report import example_result
 from scipy.spatial.transform import Rotation
 
 from bricktrack_common.clocks import ClockTriplet
@@ -15,19 +14,13 @@ from bricktrack_host.results.daq_clock import fit_edges
 from bricktrack_host.results.edge_comparison import compare_edges
 from bricktrack_host.tracks import ImuTrack
 
-spec = importlib.util.spec_from_file_location(
-    "example_report", Path(__file__).parents[3] / "scripts" / "example_report.py"
-)
-example = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(example)
-
 HZ = 50.0
 N_EDGES = 600
 
 
 @pytest.fixture(scope="module")
 def blank():
-    return example.example_result()
+    return example_result()
 
 
 def unit(

@@ -271,12 +271,11 @@ def test_path_traced_motion_follows_the_impact_and_finds_the_clock(samples):
 
 @pytest.mark.slow
 def test_real_recordings_are_followed_through_dropouts(samples):
-    from fusion_samples import bench_module
+    from bench_fusion import make_case, run_case
 
-    bench = bench_module()
     ours, interpolated, covered = [], [], []
     for path in sorted((samples / "fusion").glob("*.npz")):
-        scores, facts = bench.run_case(bench.make_case(path, seed=17))
+        scores, facts = run_case(make_case(path, seed=17))
         ours.append([scores["ours"].outside_mm, scores["ours"].inside_mm])
         interpolated.append([scores["interpolation"].outside_mm, scores["interpolation"].inside_mm])
         covered.append(facts["share within 95 %"])

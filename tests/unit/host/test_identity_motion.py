@@ -1,8 +1,6 @@
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from identity_frames import fitted_brick, tracked
 
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.evaluation.paper_brick import paper_brick
@@ -52,11 +50,7 @@ def test_rows_are_read_one_after_the_other_about_the_middle_one(calibrated):
     assert motion.dt_s[0] == pytest.approx([0.0, 100 * mode.line_time_ns * 1e-9, 0.0], abs=1e-12)
 
 
-def test_identities_hold_at_three_tenths_of_a_metre_a_second(calibrated, monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[3] / "scripts"))
-    monkeypatch.delitem(sys.modules, "identity_frames", raising=False)
-    from identity_frames import fitted_brick, tracked
-
+def test_identities_hold_at_three_tenths_of_a_metre_a_second(calibrated):
     camera, rays = calibrated
     found = tracked(
         450,

@@ -1,22 +1,15 @@
 """The film of a run: marks are where the LEDs are, frames keep their times, and nothing half-written stays."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from example_report import example_result
 
 from bricktrack_common.errors import ConfigError
 from bricktrack_host.cli.overlay import overlay
 from bricktrack_host.viewing import overlay as drawing
 from bricktrack_host.viewing.overlay import STRIP_ROWS, UNUSED, USED, OverlayArtist
-
-spec = importlib.util.spec_from_file_location(
-    "example_report", Path(__file__).parents[3] / "scripts" / "example_report.py"
-)
-example = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(example)
 
 WIDTH, HEIGHT = 1920, 1080
 BLACK = np.full((HEIGHT, WIDTH), 16, dtype=np.uint8)
@@ -24,7 +17,7 @@ BLACK = np.full((HEIGHT, WIDTH), 16, dtype=np.uint8)
 
 @pytest.fixture(scope="module")
 def result():
-    return example.example_result()
+    return example_result()
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from brick_shakes import LEVER_ARM_MM, simulate_shake
-from fusion_samples import bench_module
+from broad_windows import Recipe, make_case
 
 from bricktrack_host.fusion.estimate import fuse
 
@@ -32,11 +32,10 @@ def test_false_positions_among_the_first_frames_are_left_out(frames):
 
 @pytest.mark.skipif("BRICKTRACK_SAMPLES" not in os.environ, reason="BRICKTRACK_SAMPLES is not set")
 def test_a_false_second_frame_of_a_real_recording_does_not_carry_its_neighbours_along():
-    bench = bench_module()
     window = Path(os.environ["BRICKTRACK_SAMPLES"]) / "fusion" / "dev_27_a.npz"
-    case = bench.make_case(window, seed=0, recipe=bench.Recipe(outlier_share=0.03))
+    case = make_case(window, seed=0, recipe=Recipe(outlier_share=0.03))
     t_ns = case.t_out_ns[:50]
-    r = fuse(case.optical, case.imu, lever_arm_mm=bench.LEVER_ARM_MM, output_t_ns=t_ns)
+    r = fuse(case.optical, case.imu, lever_arm_mm=LEVER_ARM_MM, output_t_ns=t_ns)
     assert r.frame_rejected[1]
     off_mm = np.linalg.norm(r.track.t_camera_brick_mm - case.t_true_mm[:50], axis=1)
     assert off_mm.max() < 0.5  # frames and reference together scatter by 0.2 mm, a length

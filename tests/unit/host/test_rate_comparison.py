@@ -1,11 +1,10 @@
 """Gyroscope and optics beside each other stand at the instants of the samples, not of their reads."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from example_report import example_result
 
 from bricktrack_host.reporting.rate_comparison import compare_rates
 from bricktrack_host.results.run_summary import imu_camera_time_ns
@@ -15,12 +14,7 @@ READ_LATE_NS = 15_000_000  # so late that it shows beside the noise of single po
 
 @pytest.fixture(scope="module")
 def result():
-    source = Path(__file__).resolve().parents[3] / "scripts" / "example_report.py"
-    spec = importlib.util.spec_from_file_location("example_report", source)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.example_result()
+    return example_result()
 
 
 def test_late_reads_leave_no_difference_between_the_rates(result):

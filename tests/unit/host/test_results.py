@@ -1,13 +1,13 @@
 """Results on disk: the same run gives the same bytes, nothing is half written, and everything comes back."""
 
 import csv
-import importlib.util
 import json
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import example_report as example
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -22,16 +22,6 @@ from bricktrack_host.results.result_store import earlier_results, read_result, r
 from bricktrack_host.tracks import OpticalTrack
 
 ROOT = Path(__file__).parents[3]
-
-
-def load_example():
-    spec = importlib.util.spec_from_file_location("example_report", ROOT / "scripts" / "example_report.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-example = load_example()
 
 
 @pytest.fixture(scope="module")

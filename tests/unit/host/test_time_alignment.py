@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from brick_shakes import simulate_shake
+from broad_windows import make_case
 
 from bricktrack_common.errors import ConfigError, TrackingError
 from bricktrack_host.fusion.clocks.sample_clock import SampleClock
@@ -131,22 +132,17 @@ def test_few_poses_fall_back_and_none_is_an_error():
         align_times(s.optical, s.imu, prior_sd_ns=0.0)
 
 
-def test_real_recordings_are_aligned_to_the_optics(bench_fusion):
+@pytest.mark.skipif(
+    "BRICKTRACK_SAMPLES" not in os.environ,
+    reason="BRICKTRACK_SAMPLES is not set: the recordings are not part of the repository",
+)
+def test_real_recordings_are_aligned_to_the_optics():
     folder = Path(os.environ["BRICKTRACK_SAMPLES"]) / "fusion"
     errors_s = []
     for path in sorted(folder.glob("*.npz")):
-        case = bench_fusion.make_case(path, seed=11)
+        case = make_case(path, seed=11)
         a = align_times(case.optical, case.imu, prior_sd_ns=0.2e9)
         assert a.is_trusted
         errors_s.append(a.offset_ns * 1e-9 - case.offset_s)
     assert len(errors_s) == 6
     assert np.sqrt(np.mean(np.square(errors_s))) < 0.3e-3  # 0.18 ms rms was reached before; six draws
-
-
-@pytest.fixture
-def bench_fusion():
-    if "BRICKTRACK_SAMPLES" not in os.environ:
-        pytest.skip("BRICKTRACK_SAMPLES is not set: the recordings are not part of the repository")
-    from fusion_samples import bench_module
-
-    return bench_module()
