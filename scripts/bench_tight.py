@@ -35,11 +35,13 @@ from daemon_runs import DaemonRun, simulate_run
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.fusion.believed_errors import MeanBand, draw_pose_errors, pose_errors
-from bricktrack_host.fusion.estimate import FusionInput, fuse
+from bricktrack_host.fusion.estimate import FusionInput, fuse, fused_result, smooth_one
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
+from bricktrack_host.fusion.led_by_led.led_smoothing import LedStart, smooth_leds
 from bricktrack_host.fusion.pose_by_pose.fused_output import common_part
 from bricktrack_host.fusion.smoothing.smoother_kernel import CHI2_6_95
-from bricktrack_host.fusion.tight import fuse_tight, smooth_both, tight_result
+from bricktrack_host.fusion.tight import fuse_tight, tight_result
 from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracking.optical_track import solve_poses
@@ -126,8 +128,11 @@ def honesty_of(seed: int) -> dict[str, Honesty]:
     optical, settings = solve_poses(run.observations, run.camera, run.brick), FusionSettings()
     t_ns = np.arange(optical.t_ns[5], optical.t_ns[-5], STEP_NS)
     item = FusionInput(optical, run.imu, run.lever_arm_mm, t_ns)
-    first, done = smooth_both(run.observations, item, run.camera, run.brick, settings)
-    tight = tight_result(run.observations, item, first, done, settings)
+    first, leds = smooth_one(item, settings), SeenLeds.of(run.observations, run.camera)
+    start = LedStart.of(leds, first, run.camera, run.brick, settings)
+    arm_m = run.lever_arm_mm * 1e-3
+    done = smooth_leds(start, run.camera, run.brick, lever_arm_m=arm_m, settings=settings)
+    tight = tight_result(run.observations, item, fused_result(item, first, settings), done, settings)
     since = run.world.since_first_edge_s(t_ns)
     is_dropout = np.any([(since > a) & (since < a + d) for a, d in DROPOUTS], axis=0)
     is_impact = (tight.fused.track.flags & int(PoseFlag.IMPACT)) != 0

@@ -18,7 +18,6 @@ from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed
 from bricktrack_host.fusion.smoothing.covariance_kernel import M
-from bricktrack_host.fusion.smoothing.sensor_errors import root_of
 from bricktrack_host.fusion.smoothing.smoother import (
     BG,
     N_STATES,
@@ -30,6 +29,7 @@ from bricktrack_host.fusion.smoothing.smoother import (
     State,
     observe,
 )
+from bricktrack_host.fusion.smoothing.standing_doubt import Doubt, root_of
 from bricktrack_host.fusion.smoothing.transition_kernel import transition
 from bricktrack_host.tracks import FusedTrack
 
@@ -96,7 +96,7 @@ def draw_pose_errors(
     state = State(x.R[at, s.b], x.x[at, s.b])
     omega = s.problem.omega_radps[at, s.b] - state.x[:, BG]
     H = observe(state, omega, s.run.lever_arm_m, since_mid, np.zeros(len(at)))[2][..., s.estimate.of]
-    drawn = draw_state_errors(s.problem, s.passed, s.estimate, s.b, n_draws=n_draws, rng=rng)
+    drawn = draw_state_errors(s.problem, s.passed, s.estimate, s.b, doubt=s.doubt, n_draws=n_draws, rng=rng)
     errors = H @ drawn[at] + root_of(common) @ rng.standard_normal((POSE_DOF, n_draws))
     covariance = H @ s.estimate.covariance[at, s.b] @ np.swapaxes(H, 1, 2) + common
     to_mm = np.repeat([1.0, 1e3], 3)
@@ -109,10 +109,13 @@ def draw_state_errors(
     estimate: Estimate,
     b: int,
     *,
+    doubt: Doubt | None,
     n_draws: int,
     rng: np.random.Generator,
 ) -> FloatArray:
     """Return errors of the states ``estimate.of`` of run ``b``, drawn together: (K, c, n_draws), truth less.
+
+    With those of standing errors that ``doubt`` is about.
 
     Filter forwards, sample backwards: the last state is drawn by its covariance, each one before by what the
     filter knew then and what the state after it tells (C. K. Carter, R. Kohn, On Gibbs sampling for state
@@ -122,7 +125,7 @@ def draw_state_errors(
     n_steps = int(np.count_nonzero(problem.dt_s[:, b] > 0))
     after = passed.forward(of=np.arange(N_STATES))
     P, R = after.covariance[: n_steps + 1, b], after.state.R[:, b]
-    before = passed.predicted(np.arange(n_steps + 1), b, of=np.zeros(0, dtype=np.int64)).P[1:]
+    before = passed.predicted(b)[1 : n_steps + 1]
     F, moving = np.tile(np.eye(N_STATES), (n_steps, 1, 1)), np.zeros((M, N_STATES))
     for k in range(n_steps):
         transition(passed.runs[b], k, R[k], moving)
@@ -139,9 +142,10 @@ def draw_state_errors(
     for k in range(n_steps - 1, -1, -1):
         now = gain[k] @ now + _root_in_own_units(rest[k]) @ rng.standard_normal((N_STATES, n_draws))
         drawn[k] = now[of]
-    if estimate.doubt is not None:
-        doubt = estimate.doubt[: n_steps + 1, b]
-        drawn += doubt @ rng.standard_normal((doubt.shape[2], n_draws))
+    if doubt is not None:
+        standing = rng.standard_normal((len(doubt.root), n_draws))
+        for nodes, moved in doubt.stretches(estimate.state, b):
+            drawn[nodes] += (moved @ standing)[: n_steps + 1 - nodes.start]
     return drawn
 
 

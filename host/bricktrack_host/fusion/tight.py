@@ -28,10 +28,9 @@ from bricktrack_host.fusion.estimate import (
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_by_led.led_smoothing import SmoothedLeds, smooth_leds
+from bricktrack_host.fusion.led_by_led.led_smoothing import LedStart, SmoothedLeds, smooth_leds
 from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion
 from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraAlignment, CameraImu
-from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed
 from bricktrack_host.tracks import ImuTrack, LedObservations, OpticalTrack
 
 logger = logging.getLogger(__name__)
@@ -111,33 +110,23 @@ def fuse_tight(
     require_observable(camera, camera_imu)
     settings = settings or FusionSettings()
     item = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment, camera_imu, camera_alignment)
-    first, done = smooth_both(observations, item, ray_model, brick_model, settings)
-    return tight_result(observations, item, first, done, settings)
-
-
-def smooth_both(
-    observations: LedObservations,
-    item: FusionInput,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    settings: FusionSettings,
-) -> tuple[Smoothed, SmoothedLeds]:
-    """Return the states of the pose-level smoother, and those of the tightly coupled one from there."""
     first = smooth_one(item, settings)
-    lever_arm_m = np.asarray(item.lever_arm_mm, dtype=np.float64) * 1e-3
-    leds = SeenLeds.of(observations, ray_model)
-    return first, smooth_leds(leds, first, ray_model, brick_model, lever_arm_m=lever_arm_m, settings=settings)
+    pose_level = fused_result(item, first, settings)
+    start = LedStart.of(SeenLeds.of(observations, ray_model), first, ray_model, brick_model, settings)
+    del first  # memory need not hold both smoothers
+    arm_m = np.asarray(lever_arm_mm, dtype=np.float64) * 1e-3
+    done = smooth_leds(start, ray_model, brick_model, lever_arm_m=arm_m, settings=settings)
+    return tight_result(observations, item, pose_level, done, settings)
 
 
 def tight_result(
     observations: LedObservations,
     item: FusionInput,
-    first: Smoothed,
+    pose_level: FusionResult,
     done: SmoothedLeds,
     settings: FusionSettings,
 ) -> TightResult:
-    """Return what is given out of the states that `smooth_both` returns."""
-    pose_level = fused_result(item, first, settings)
+    """Return what is given out of smoothed states, beside the motion pose by pose that they began with."""
     leds, smoothed, use, scale = done.leds, done.states, done.use, float(done.noise_scales[0])
     seen_ns = np.unique(item.optical.t_ns[leds.frame[use]])
     track = sample_motion(

@@ -1,7 +1,5 @@
 """Errors drawn as the smoother believes them, against a dense solution, and the band of their means."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from brick_shakes import LEVER_ARM_MM, simulate_shake
@@ -16,6 +14,7 @@ from bricktrack_host.fusion.believed_errors import (
 from bricktrack_host.fusion.estimate import FusionInput, fused_result, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
+from bricktrack_host.fusion.smoothing.sensor_errors import with_sensor_doubt
 from bricktrack_host.fusion.smoothing.smoother import residuals
 from bricktrack_host.fusion.smoothing.transition_kernel import transition
 from bricktrack_host.normalised_errors import normalised_squares
@@ -66,7 +65,7 @@ def test_drawn_errors_have_the_covariance_of_nodes_and_between_them(smoothed):
     problem, passed = smoothed.problem, smoothed.passed
     estimate = passed.smooth()
     rng = np.random.default_rng(1)
-    drawn = draw_state_errors(problem, passed, estimate, 0, n_draws=N_DRAWS, rng=rng)[:, :6]
+    drawn = draw_state_errors(problem, passed, estimate, 0, doubt=None, n_draws=N_DRAWS, rng=rng)[:, :6]
     dense = dense_covariance(problem, passed, estimate.state)[:, :, :6, :6]
     sd = np.sqrt(np.diagonal(np.diagonal(dense), axis1=0, axis2=1))  # (K, c)
     # Draws scatter their sd by 1 / sqrt(2 N); the filter took H where it was then, the dense solution where it
@@ -84,15 +83,21 @@ def test_drawn_errors_have_the_covariance_of_nodes_and_between_them(smoothed):
 
 
 def test_a_standing_error_is_one_over_the_whole_run(smoothed):
-    estimate = smoothed.passed.smooth()
-    doubt = np.zeros((*estimate.covariance.shape[:3], 1))
-    doubt[:, :, 3] = 1.0  # a metre along x: everything else is nothing beside it
+    problem, passed, estimate = smoothed.problem, smoothed.passed, smoothed.passed.smooth()
+    unsure = np.zeros((21, 21))
+    unsure[18, 18] = 1e6  # a kilometre of the arm along x: everything else is nothing beside it
+    with_doubt, (doubt,) = with_sensor_doubt(problem, passed, estimate, [unsure])
     drawn = draw_state_errors(
-        smoothed.problem, smoothed.passed, replace(estimate, doubt=doubt), 0,
-        n_draws=N_DRAWS, rng=np.random.default_rng(2),
-    )  # fmt: skip
-    assert drawn[:, 3].std() == pytest.approx(1.0, rel=0.05)
-    assert np.abs(drawn[:, 3] - drawn[0, 3]).max() < 0.05
+        problem, passed, estimate, 0, doubt=doubt, n_draws=N_DRAWS, rng=np.random.default_rng(2)
+    )[:, 3:6]
+    added = with_doubt.covariance[:, 0] - estimate.covariance[:, 0]
+    sd_m = np.sqrt(np.diagonal(added, axis1=1, axis2=2)[:, 3:6])
+    assert drawn.std(axis=2) == pytest.approx(sd_m, rel=0.05, abs=0.01)
+    # What it does at a node is one number of a draw for all nodes, whichever axis shows it best.
+    largest, nodes = np.argmax(sd_m, axis=1), np.arange(len(sd_m))
+    unit = drawn[nodes, largest] / sd_m[nodes, largest, None]
+    assert sd_m[nodes, largest].min() > 0.3
+    assert np.abs(np.abs(unit) - np.abs(unit[0])).max() < 0.05
 
 
 def correlated_squares(rng, n, n_runs, gain, memory):

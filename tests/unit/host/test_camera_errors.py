@@ -124,9 +124,9 @@ def test_what_is_carried_along_is_the_derivative_of_the_relative_motion():
         one = np.zeros((44, 44))
         one[21 + error, 21 + error] = 1.0
         more = (
-            with_sensor_doubt(
-                problem, passed, estimate, [one], R_still_camera=[nodes.camera_attitudes(run)]
-            ).covariance
+            with_sensor_doubt(problem, passed, estimate, [one], R_still_camera=[nodes.camera_attitudes(run)])[
+                0
+            ].covariance
             - estimate.covariance
         )
         # Of the origin: what the arm to the sensor makes of an attitude's error belongs to it.

@@ -11,7 +11,7 @@ from bricktrack_host.fusion.estimate import FusionInput, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led import led_smoothing, standing_errors
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_by_led.led_smoothing import smooth_leds
+from bricktrack_host.fusion.led_by_led.led_smoothing import LedStart, smooth_leds
 from bricktrack_host.fusion.led_by_led.standing_errors import StandingPrior, StandingWay, _likeliest
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.fusion.smoothing.smoother import POS, Filter
@@ -26,8 +26,8 @@ def smoothed(run):
     item = FusionInput(optical, run.imu, run.lever_arm_mm, optical.t_ns[5:-5])
     first = smooth_poses([prepare_run(item, SETTINGS)], SETTINGS)[0]
     leds = SeenLeds.of(run.observations, run.camera)
-    arm_m = run.lever_arm_mm * 1e-3
-    return smooth_leds(leds, first, run.camera, run.brick, lever_arm_m=arm_m, settings=SETTINGS)
+    start = LedStart.of(leds, first, run.camera, run.brick, SETTINGS)
+    return smooth_leds(start, run.camera, run.brick, lever_arm_m=run.lever_arm_mm * 1e-3, settings=SETTINGS)
 
 
 def plain_run():
@@ -78,10 +78,11 @@ def test_the_derivative_of_the_smoothed_motion_is_that_of_the_filter(plain):
     problem = replace(now.problem, leds=arrays)
     passed = Filter(problem)
     before = passed.smooth()
-    way = StandingWay(problem, passed, leds, last.pictured, 7, of=before.of, n_views=done.errors.n_views)
+    way = StandingWay(problem, passed, leds, last.pictured, 7, n_views=done.errors.n_views)
     sure = np.zeros_like(done.errors.covariance)
     sure[FIRST_LED + 6, FIRST_LED + 6] = 1.0  # u of the fourth LED, px
-    more = way.with_doubt(before, replace(done.errors, covariance=sure)).covariance[:, 0]
+    doubt = way.doubt(replace(done.errors, covariance=sure), before.of)
+    more = doubt.added_to(before, 0).covariance[:, 0]
     found = np.sqrt(np.diagonal(more - before.covariance[:, 0], axis1=1, axis2=2)[:, 3:6])
     off_px = np.where(leds.led == 3, 0.1, 0.0)[:, None] * [1, 0]
     moved = replace(problem, leds=arrays._replace(residual_px=arrays.residual_px + off_px))
@@ -96,13 +97,12 @@ def test_what_acceleration_draws_centroids_by_is_not_told_but_makes_all_unsure(p
     done, last = plain
     problem, pictured, leds = last.states.problem, last.pictured, done.leds
     n_views = done.errors.n_views
-    of = last.states.estimate.of
 
     def errors(drawn, spread_sd):
         monkeypatch.setattr(standing_errors, "_SPREAD_SD", spread_sd)
         seen = problem.leds.residual_px - drawn * pictured.accelerated_px
         moved = replace(problem, leds=problem.leds._replace(residual_px=seen))
-        way = StandingWay(moved, Filter(moved), leds, pictured, 7, of=of, n_views=n_views)
+        way = StandingWay(moved, Filter(moved), leds, pictured, 7, n_views=n_views)
         prior = StandingPrior.of(leds, pictured, 7, SETTINGS, n_views=n_views, camera_moves=False)
         return way.estimate(prior, np.zeros_like(done.errors.value))
 

@@ -26,15 +26,6 @@ def rotation_of(x: float, y: float, z: float) -> Any:
 
 
 @compiled_in_place
-def write_rotation(v: Any, out: Any) -> None:
-    """Write Exp of a rotation vector."""
-    E = rotation_of(v[0], v[1], v[2])
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = E[3 * i + j]
-
-
-@compiled_in_place
 def _columns(A: Any, i: int, B: Any, j: int) -> float:
     """Return the product of column i of A and column j of B: an element of A^T B."""
     return float(A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j])

@@ -109,7 +109,7 @@ def _angle_at(pieces: SignalPieces, t_s: float, near: int, out: Any) -> int:
     return i
 
 
-class _Room(NamedTuple):
+class StepRoom(NamedTuple):
     """Room to work in: what was at the start of a sub-step, and what came on since."""
 
     angle: FloatArray
@@ -123,6 +123,24 @@ class _Room(NamedTuple):
     middle: FloatArray
 
 
+@compiled
+def step_room() -> StepRoom:
+    """Return room for any number of steps, one after the other."""
+    return StepRoom(
+        np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3),
+        np.empty(3), np.empty((3, 3)),
+    )  # fmt: skip
+
+
+@compiled_inline
+def gyro_at(pieces: SignalPieces, t_s: float, near: int, out: Any) -> None:
+    """Write the angular rate, held constant beyond the samples."""
+    held = min(max(t_s, pieces.span_s[0]), pieces.span_s[1])
+    i = piece_of(pieces.knots_s, held, near)
+    for a in range(3):
+        out[a] = _cubic(pieces.gyro, i, a, held - pieces.knots_s[i])
+
+
 @compiled_inline
 def _felt(
     pieces: SignalPieces,
@@ -132,7 +150,7 @@ def _felt(
     dt: float,
     is_first: bool,
     acc_bias: Any,
-    room: _Room,
+    room: StepRoom,
     f_rate: Any,
     f_curve: Any,
 ) -> int:
@@ -159,7 +177,7 @@ def _felt(
 
 
 @compiled_inline
-def _turn_since(room: _Room, angle_rate_bias: Any, h: float, R: Any) -> None:
+def _turn_since(room: StepRoom, angle_rate_bias: Any, h: float, R: Any) -> None:
     """Turn R by how the angle has changed since the instant before."""
     now, before = room.angle, room.angle_before
     E = rotation_of(
@@ -173,7 +191,7 @@ def _turn_since(room: _Room, angle_rate_bias: Any, h: float, R: Any) -> None:
 
 
 @compiled_inline
-def _integrate_step(
+def integrate_step(
     pieces: SignalPieces,
     start_s: float,
     dt: float,
@@ -186,7 +204,7 @@ def _integrate_step(
     R_half: Any,
     f_rate: Any,
     f_curve: Any,
-    room: _Room,
+    room: StepRoom,
     i: int,
     j: int,
 ) -> tuple[int, int]:
@@ -240,20 +258,10 @@ def integrate_steps(
 
     The outputs have the shapes of `imu_signal.Increments`.
     """
-    room = _Room(
-        angle=np.empty(3),
-        angle_before=np.empty(3),
-        once=np.empty(3),
-        twice=np.empty(3),
-        velocity=np.empty(3),
-        shift=np.empty(3),
-        force_first=np.empty(3),
-        slope_first=np.empty(3),
-        middle=np.empty((3, 3)),
-    )
+    room = step_room()
     i, j = 0, 0
     for n in range(len(start_s)):
-        i, j = _integrate_step(
+        i, j = integrate_step(
             pieces, start_s[n], end_s[n] - start_s[n], gyro_bias[n], acc_bias[n], acc_lag_s,
             R[n], dv[n], dp[n], R_half[n], f_rate[n], f_curve[n], room, i, j,
         )  # fmt: skip

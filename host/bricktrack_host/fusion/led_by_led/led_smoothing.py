@@ -75,6 +75,64 @@ class SmoothedLeds:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Sights:
+    """LEDs with the pictures that a motion lets expect, and which of them stand still."""
+
+    leds: SeenLeds
+    pictured: Pictured
+    still: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LedStart:
+    """All that the LEDs' smoother takes from the pose-level one, which memory need not hold any longer.
+
+    Attributes
+    ----------
+    sights : _Sights
+        Of the LEDs at whose instants that motion is sure enough.
+    run, lin : Run, Linearisation
+    origin_m : ndarray, shape (K, 3)
+        Where the brick's origin was at its nodes.
+    used, scale, levels, chi2
+        As in `Smoothed`.
+    """
+
+    sights: _Sights
+    run: Run
+    lin: Linearisation
+    origin_m: FloatArray
+    used: BoolArray
+    scale: FloatArray
+    levels: tuple[NoiseLevel, NoiseLevel]
+    chi2: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        leds: SeenLeds,
+        first: Smoothed,
+        ray_model: RayModel,
+        brick_model: BrickModel,
+        settings: FusionSettings,
+    ) -> "LedStart":
+        """Return it from the pose-level smoother's states.
+
+        Raises
+        ------
+        TrackingError
+            If these are nowhere sure enough.
+        """
+        placeable = _placeable(leds, first, settings)
+        if not len(placeable.t_ns):
+            raise TrackingError("the motion pose by pose is too unsure to say where any LED should be seen")
+        sights, _ = _sights(placeable, first, ray_model, brick_model)
+        lin = relinearised(first.run, first.estimate, first.b, len(first.nodes.t_s), settings)
+        origin_m = _origin_m(first)[: len(first.nodes.t_s)]
+        return cls(sights, first.run, lin, origin_m, first.used, first.scale, first.levels, first.chi2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Belief:
     """What is believed of noise and errors when a pass begins."""
 
@@ -83,15 +141,6 @@ class _Belief:
     levels: tuple[NoiseLevel, NoiseLevel]
     settings: FusionSettings
     errors: StandingErrors
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sights:
-    """LEDs with the pictures that a motion lets expect, and which of them stand still."""
-
-    leds: SeenLeds
-    pictured: Pictured
-    still: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,8 +172,7 @@ class _Pass:
 
 
 def smooth_leds(
-    leds: SeenLeds,
-    first: Smoothed,
+    first: LedStart,
     ray_model: RayModel,
     brick_model: BrickModel,
     *,
@@ -133,22 +181,19 @@ def smooth_leds(
 ) -> SmoothedLeds:
     """Return the smoothed states, and how far each LED lies from what all others say.
 
-    Pictures are predicted for the pose-level motion ``first``, then for what came of it, and so on. Outliers
+    Pictures are predicted for the pose-level motion, then for what came of it, and so on. Outliers
     are judged with hindsight each time and may come back; the noise, and errors that stand still, are taken
     anew from each pass, until what a pass changes is little beside what is not known anyway.
     """
     n_leds = brick_model.n_leds
-    placeable = _placeable(leds, first, settings)
-    if not len(placeable.t_ns):
-        raise TrackingError("the motion pose by pose is too unsure to say where any LED should be seen")
-    sights, _ = _sights(placeable, first, ray_model, brick_model)
+    sights, lin, before_m = first.sights, first.lin, first.origin_m
     n_views = views_told(sights.pictured)
     errors = StandingErrors.before(first.run, lever_arm_m, n_leds, n_views=n_views)
     belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
-    now, use = first, np.ones(len(sights.leds.t_ns), dtype=np.bool_)
+    use = np.ones(len(sights.leds.t_ns), dtype=np.bool_)
     i = 0
     while True:
-        ready = _prepared(sights, use, now, first, belief)
+        ready = _prepared(sights, use, lin, first, belief)
         if i == _NOISE_CHOSEN_IN:
             noise = choose_inertial_noise(
                 ready.problem, ready.run, ready.nodes, ready.lin, belief.levels, belief.settings
@@ -156,21 +201,22 @@ def smooth_leds(
             belief = replace(
                 belief, levels=noise.levels(belief.levels), settings=noise.settings(belief.settings)
             )
-            ready = _prepared(sights, use, now, first, belief)
+            del ready
+            ready = _prepared(sights, use, lin, first, belief)
         done = _pass(ready, first, belief)
-        moved_sds = _moved_sds(now, done.states)
         leds, now = sights.leds, done.states
+        moved_sds = _moved_sds(before_m, now)
         still = now.nodes.camera_attitudes(now.run)
         prior = StandingPrior.of(
             leds, done.pictured, n_leds, settings, n_views=n_views, camera_moves=still is not None
         )
         way = StandingWay(
-            now.problem, now.passed, leds, done.pictured, n_leds,
-            of=now.estimate.of, n_views=n_views, R_still_camera=still,
+            now.problem, now.passed, leds, done.pictured, n_leds, n_views=n_views, R_still_camera=still
         )  # fmt: skip
         errors = way.estimate(prior, belief.errors.value)
         if i == _MOST_PASSES - 1 or (i > _NOISE_CHOSEN_IN and moved_sds < _STANDS_SDS):
-            states = replace(now, estimate=way.with_doubt(now.estimate, errors))
+            doubt = way.doubt(errors, now.estimate.of)
+            states = replace(now, estimate=doubt.added_to(now.estimate, 0), doubt=doubt)
             return SmoothedLeds(leds, states, done.chi2, done.use, belief.scales, errors)
         scales = centroid_scales(done.chi2, sights.still, done.use, belief.scales)
         more = (scales / belief.scales)[sights.still.astype(np.int64)]
@@ -180,14 +226,15 @@ def smooth_leds(
         if not done.holds():
             sights, placed = _sights(leds, now, ray_model, brick_model)
             use = use[placed]
+        lin, before_m = relinearised(now.run, now.estimate, 0, len(now.nodes.t_s), settings), _origin_m(now)
         i += 1
-        del ready, done, way  # the next pass makes its own: memory holds one
+        del ready, done, now, way  # of each pass only what the next one needs: memory holds one
 
 
-def _moved_sds(before: Smoothed, now: Smoothed) -> float:
-    """Return by how much a pass has moved the brick on the mean, in sd of each axis."""
-    n = min(len(before.nodes.t_s), len(now.nodes.t_s))
-    moved_m = _origin_m(now)[:n] - _origin_m(before)[:n]
+def _moved_sds(before_m: FloatArray, now: Smoothed) -> float:
+    """Return by how much a pass has moved the brick from where it was at the nodes on the mean, in sd."""
+    n = min(len(before_m), len(now.nodes.t_s))
+    moved_m = _origin_m(now)[:n] - before_m[:n]
     return float(np.sqrt(np.nanmean(moved_m**2 / now.estimate.variance[:n, 0, POS])))
 
 
@@ -197,13 +244,14 @@ def _origin_m(s: Smoothed) -> FloatArray:
     return np.asarray(state.x[:, s.b, POS] - state.R[:, s.b] @ s.run.lever_arm_m)
 
 
-def _prepared(sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, belief: _Belief) -> _Ready:
-    """Return the problem of sights by what is believed, linearised at the motion ``now``."""
+def _prepared(
+    sights: _Sights, use: BoolArray, lin: Linearisation, first: LedStart, belief: _Belief
+) -> _Ready:
+    """Return the problem of sights by what is believed."""
     settings, leds, pictured = belief.settings, sights.leds, sights.pictured
     off_px = belief.errors.in_picture_px(leds, pictured)
     pictured = replace(pictured, residual_px=pictured.residual_px - off_px)
     use = use & pictured.is_facing
-    lin = relinearised(now.run, now.estimate, now.b, len(now.nodes.t_s), settings)
     run = _without_frames(belief.run.with_acc_loss(lin.loss_s2))
     nodes = Nodes(place_nodes(first.run, lin).t_s, np.zeros(0, dtype=np.int64))
     problem, _ = build_problem(
@@ -217,13 +265,13 @@ def _prepared(sights: _Sights, use: BoolArray, now: Smoothed, first: Smoothed, b
     return _Ready(pictured, use, run, nodes, lin, replace(problem, leds=arrays))
 
 
-def _pass(ready: _Ready, first: Smoothed, belief: _Belief) -> _Pass:
+def _pass(ready: _Ready, first: LedStart, belief: _Belief) -> _Pass:
     """Smooth once."""
     passed = Filter(ready.problem)
     estimate = passed.smooth()
-    states = replace(
-        first, run=ready.run, nodes=ready.nodes, lin=ready.lin, problem=ready.problem, passed=passed,
-        estimate=estimate, b=0, levels=belief.levels,
+    states = Smoothed(
+        ready.run, ready.nodes, ready.lin, ready.problem, passed, estimate, 0,
+        used=first.used, scale=first.scale, levels=belief.levels, chi2=first.chi2, doubt=None,
     )  # fmt: skip
     return _Pass(ready.pictured, ready.use, states, led_chi2(ready.problem, estimate))
 

@@ -38,9 +38,14 @@ class AmongThemselves:
     noise_sd: FloatArray
 
     @classmethod
-    def of(cls, arrays: LedArrays, leds: SeenLeds, by_error: FloatArray) -> "AmongThemselves":
-        """Return what is measured in a run; errors move its pictures by ``by_error``, shape (m, 2, q)."""
-        n_leds, q = int(leds.led.max(initial=0)) + 1, by_error.shape[2]
+    def of(cls, arrays: LedArrays, leds: SeenLeds, of_all: FloatArray, n_leds: int) -> "AmongThemselves":
+        """Return what is measured in a run.
+
+        Of q = d + 2 L errors: those that all LEDs share move their pictures by ``of_all``, shape (m, 2, d);
+        then come (u, v) of each of ``n_leds``.
+        """
+        n_shared = of_all.shape[2]
+        q = n_shared + 2 * n_leds
         n_in_frame = np.bincount(leds.frame[arrays.use], minlength=int(leds.frame.max(initial=0)) + 1)
         rows = np.flatnonzero(arrays.use & (n_in_frame[leds.frame] >= _LEAST_LEDS))
         if not rows.size:
@@ -64,12 +69,13 @@ class AmongThemselves:
         share, ways = np.linalg.eigh(normal / np.outer(root, root))
         kept = share > _LEAST_SEEN
         share, ways = share[kept], ways[:, kept]
-        count = np.maximum(np.bincount(led, minlength=n_leds), 1)
-        mean = np.zeros((n_leds, 2, q))
-        np.add.at(mean, led, by_error[rows])
-        mean /= count[:, None, None]
+        count = np.bincount(led, minlength=n_leds)
+        mean = np.zeros((2 * n_leds, q))
+        for i, moved in enumerate(of_all[rows].reshape(len(rows), 2 * n_shared).T):
+            mean[i // n_shared :: 2, i % n_shared] = np.bincount(led, moved, n_leds) / np.maximum(count, 1)
+        mean[:, n_shared:] = np.diag(np.repeat(count > 0, 2))
         weighted = (ways * root[:, None]).T
-        return cls(weighted @ mean.reshape(-1, q), ways.T @ (pull / root) / share, 1 / np.sqrt(share))
+        return cls(weighted @ mean, ways.T @ (pull / root) / share, 1 / np.sqrt(share))
 
     def belief(self, prior: FloatArray, known: FloatArray) -> FloatArray:
         """Return log-likelihoods of priors, shape (..., q, q), where ``known``, (q,), was taken out."""

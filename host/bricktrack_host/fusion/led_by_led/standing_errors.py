@@ -13,7 +13,7 @@ the filter: one weighted least squares over the run gives them, and what stays u
 unsure by the same derivatives.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,23 +24,13 @@ from bricktrack_host.fusion.led_by_led.led_measurements import Pictured, SeenLed
 from bricktrack_host.fusion.led_by_led.leds_among_themselves import AmongThemselves
 from bricktrack_host.fusion.led_by_led.shape_errors import shape_covariance_px2
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
-from bricktrack_host.fusion.smoothing.camera_errors import (
-    N_CAMERA_ERRORS,
-    CameraErrors,
-    CameraWay,
-    camera_prior_sd,
-)
-from bricktrack_host.fusion.smoothing.sensor_errors import (
-    N_ERRORS,
-    SensorErrors,
-    root_of,
-    sensor_prior_sd,
-)
-from bricktrack_host.fusion.smoothing.smoother import N_STATES, POS, Estimate, Filter, Problem
-from bricktrack_host.fusion.smoothing.standing_errors_kernel import Way, carry_back, carry_forward
+from bricktrack_host.fusion.smoothing.camera_errors import CameraErrors, CameraWay, camera_prior_sd
+from bricktrack_host.fusion.smoothing.sensor_errors import N_ERRORS, SensorErrors, sensor_prior_sd
+from bricktrack_host.fusion.smoothing.smoother import Filter, Problem
+from bricktrack_host.fusion.smoothing.standing_doubt import ARM, Doubt, ErrorWay, root_of
+from bricktrack_host.fusion.smoothing.standing_errors_kernel import N_GAINS, Sight
 from bricktrack_host.tracking.pose.refine import OWN_SHARE
 
-_ARM = slice(18, N_ERRORS)
 _PROFILE, _SCALE, _SPREAD = range(N_ERRORS, N_ERRORS + 3)
 _FIRST_LED = N_ERRORS + 3
 N_VIEWS = 6  # see `_by_view`
@@ -65,7 +55,6 @@ _HIDDEN_SHARE = np.sqrt(2)
 """Of single LEDs' errors, what is believed over what they show among themselves. To the pictures that show it
 the shape of the LEDs was fitted, and often their places: what looks like a pose was left. Recordings by
 another renderer than this project's had 1.4 times as much on the median (simulated)."""
-_NODES_AT_ONCE = 64  # of the motion's doubt: more are only more memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,11 +97,11 @@ class StandingErrors:
     def of_sensor(self, *, since: "StandingErrors") -> SensorErrors:
         """Return what the inertial sensor's errors have changed by."""
         change = self.value - since.value
-        gyro, acc = change[:18].reshape(2, 3, 3)
+        gyro, acc = change[:N_GAINS].reshape(2, 3, 3)
         theirs = _FIRST_LED + 2 * self.n_views * self.n_leds
         at = np.append(np.arange(N_ERRORS), np.arange(theirs, len(change)))
         camera = CameraErrors.of(change[theirs:]) if theirs < len(change) else None
-        return SensorErrors(gyro, acc, change[_ARM], self.covariance[np.ix_(at, at)], camera)
+        return SensorErrors(gyro, acc, change[ARM], self.covariance[np.ix_(at, at)], camera)
 
     def in_picture_px(self, leds: SeenLeds, pictured: Pictured) -> FloatArray:
         """Return by how much the centroids are off for them, shape (m, 2)."""
@@ -204,8 +193,6 @@ class StandingWay:
     leds, pictured : SeenLeds, Pictured
         Those of the problem.
     n_leds, n_views : int
-    of : ndarray of int64, shape (c,)
-        The states whose covariance is wanted.
     R_still_camera : ndarray, shape (K, 3, 3), optional
         Attitudes of a moving camera at the nodes.
     """
@@ -218,28 +205,37 @@ class StandingWay:
         pictured: Pictured,
         n_leds: int,
         *,
-        of: IntArray,
         n_views: int = N_VIEWS,
         R_still_camera: FloatArray | None = None,
     ) -> None:
-        self._camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, 0)
-        own = _own_part(problem, leds, pictured, (n_leds, n_views), self._camera)
-        further = np.zeros((len(problem.dt_s), 3, 0)) if self._camera is None else self._camera.velocity
-        if problem.leds is None:
+        arrays = problem.leds
+        if arrays is None:
             raise ValueError("the problem has no LEDs")
-        pictures = -own[:, :, _PROFILE : _FIRST_LED + 2 * n_leds]
-        self._among_themselves = AmongThemselves.of(problem.leds, leds, pictures)
-        q, kept = own.shape[2], passed.kept(0)
-        self._of, self._normal, self._pull = of, np.empty((q, q)), np.empty(q)
-        self._way = Way(passed.runs[0], *kept, own, further, np.empty((len(kept[-1]), N_STATES * q)))
-        carry_forward(self._way, self._normal, self._pull)
+        of_all = _of_all_leds(pictured)
+        self._among_themselves = AmongThemselves.of(arrays, leds, of_all, n_leds)
+        camera, last = None, np.zeros((len(of_all), 2, 0))
+        if R_still_camera is not None:
+            camera = CameraWay.of(problem, R_still_camera, 0)
+            node = np.repeat(np.arange(len(problem.has_frame)), np.diff(arrays.first[:, 0]))
+            t_s = camera.t_s[node] + arrays.dt_s
+            last = arrays.J @ camera.of_seen(arrays.R_lin, arrays.t_lin_m, t_s)
+        sight = Sight(
+            first=np.ascontiguousarray(arrays.first[:, 0]),
+            use=arrays.use,
+            shared=np.concatenate([arrays.J[..., 3:] @ arrays.R_lin, -of_all], axis=2),
+            by_view=_by_view(pictured, n_views),
+            led=leds.led,
+            n_leds=n_leds,
+            last=last,
+        )
+        self._way = ErrorWay.of(passed, 0, sight, camera)
 
     def estimate(self, prior: StandingPrior, known: FloatArray) -> StandingErrors:
         """Return the likeliest errors and their covariance, where ``known``, shape (q,), was taken out.
 
         The sd of single LEDs' errors is the root of its mean square given what they say among themselves.
         """
-        normal, pull = self._normal, self._pull
+        normal, pull = self._way.normal, self._way.pull
         n_leds = len(prior.led_shift_px)
         part = slice(_PROFILE, _FIRST_LED + 2 * n_leds)
         of_pictures = prior.covariance(_OFFSET_SDS_PX)[:, part, part]
@@ -254,29 +250,9 @@ class StandingWay:
         covariance += _SPREAD_SD**2 * np.outer(drawn, drawn)
         return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px, n_leds, prior.n_views)
 
-    def with_doubt(self, estimate: Estimate, errors: StandingErrors) -> Estimate:
-        """Return smoothed states with what the errors leave unsure in their covariance."""
-        state, of = estimate.state, self._of
-        doubt = np.empty((len(state.x), len(of), len(self._pull)), dtype=np.float32)
-        carry_back(self._way, of, doubt)
-        covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
-        root, at = root_of(errors.covariance), np.searchsorted(of, np.arange(POS.start, POS.stop))[:, None]
-        theirs = None
-        if self._camera is not None:
-            theirs = self._camera.of_output(state.R[:, 0], state.x[:, 0, POS], of)
-        for start in range(0, len(doubt), _NODES_AT_ONCE):
-            nodes = slice(start, start + _NODES_AT_ONCE)
-            changed = doubt[nodes].astype(np.float64)
-            # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
-            changed[:, at, np.arange(_ARM.start, _ARM.stop)] -= state.R[nodes, 0]
-            if theirs is not None:
-                changed[:, :, -N_CAMERA_ERRORS:] += theirs[nodes]
-            of_nodes = changed @ root
-            more = of_nodes @ np.swapaxes(of_nodes, 1, 2)
-            covariance[nodes, 0] += more
-            variance[nodes, 0, of] += np.diagonal(more, axis1=1, axis2=2)
-            doubt[nodes] = of_nodes
-        return replace(estimate, covariance=covariance, variance=variance, doubt=doubt[:, None])
+    def doubt(self, errors: StandingErrors, of: IntArray) -> Doubt:
+        """Return what the errors leave unsure of smoothed states ``of``, shape (c,)."""
+        return Doubt(self._way, root_of(errors.covariance), of)
 
 
 def views_told(pictured: Pictured) -> int:
@@ -301,32 +277,6 @@ def _by_view(pictured: Pictured, n_views: int) -> FloatArray:
 def _of_all_leds(pictured: Pictured) -> FloatArray:
     """Return what each error that all LEDs share moves their centroids by, shape (m, 2, 3), px."""
     return np.stack([pictured.profile_shift_px, pictured.from_centre_px, pictured.accelerated_px], axis=2)
-
-
-def _own_part(
-    problem: Problem,
-    leds: SeenLeds,
-    pictured: Pictured,
-    leds_and_views: tuple[int, int],
-    camera: CameraWay | None,
-) -> FloatArray:
-    """Return what each error changes of each LED's residual by itself, shape (m, 2, q)."""
-    arrays = problem.leds
-    if arrays is None:
-        raise ValueError("the problem has no LEDs")
-    m, (n_leds, n_views) = len(leds.t_ns), leds_and_views
-    own = np.zeros((m, 2, _FIRST_LED + 2 * n_views * n_leds))
-    own[:, :, _ARM] = arrays.J[..., 3:] @ arrays.R_lin
-    own[:, :, _PROFILE:_FIRST_LED] = -_of_all_leds(pictured)
-    for k, view in enumerate(_by_view(pictured, n_views).T):
-        at = _FIRST_LED + 2 * (n_leds * k + leds.led)
-        own[np.arange(m), 0, at] = -view
-        own[np.arange(m), 1, at + 1] = -view
-    if camera is None:
-        return own
-    node = np.repeat(np.arange(len(problem.has_frame)), np.diff(arrays.first[:, 0]))
-    moved = camera.of_seen(arrays.R_lin, arrays.t_lin_m, camera.t_s[node] + arrays.dt_s)
-    return np.concatenate([own, arrays.J @ moved], axis=2)
 
 
 def _likeliest(

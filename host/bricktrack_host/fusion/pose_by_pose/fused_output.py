@@ -5,27 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
-from bricktrack_host.fusion.pose_by_pose.sampling_kernel import covariance_between
+from bricktrack_host.fusion.pose_by_pose.sampling_kernel import Path, carry_between, covariance_between
 from bricktrack_host.fusion.smoothing.covariance_kernel import are_definite
-from bricktrack_host.fusion.smoothing.smoother import (
-    BA,
-    BG,
-    GRAV,
-    LAG,
-    POS,
-    SKEW,
-    TAU,
-    VEL,
-    Estimate,
-    Problem,
-    State,
-    observe,
-)
+from bricktrack_host.fusion.smoothing.smoother import LAG, SEEN, SKEW, TAU, Estimate, Problem, State
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.tracks import FusedTrack, median_frame
 
@@ -58,23 +44,19 @@ def sample_motion(
     A filter's state (``is_smoothed`` false) knows nothing of the node after and is only carried on.
     """
     at = _carry(run, nodes, estimate.state, b, output_t_ns, is_smoothed=is_smoothed)
-    zero = np.zeros(len(at.t_s))
-    camera = None if run.camera is None else run.camera.still_omega_radps(at.t_s)
-    R_out, p_out, H = observe(
-        at.state, at.omega_radps, run.lever_arm_m, at.t_cam_s - run.t_mid_s, zero, camera_omega_radps=camera
-    )
+    R, turn, arm_m = at.R, at.omega_radps, run.lever_arm_m
+    p_m = at.p_m - R @ arm_m
+    v_mps = at.v_mps - np.einsum("nij,nj->ni", R, np.cross(at.omega_radps, arm_m))
+    v_seen_mps = v_mps
+    if run.camera is not None:
+        camera = run.camera.still_omega_radps(at.t_s)
+        turn = turn - np.einsum("nji,nj->ni", R, camera)
+        v_seen_mps = v_mps - np.cross(camera, p_m)
     P = covariance_between(
-        np.ascontiguousarray(estimate.covariance[:, b]), at.node, at.share if is_smoothed else zero,
-        np.ascontiguousarray(H[..., estimate.of]),
+        np.ascontiguousarray(estimate.covariance[:, b]), np.searchsorted(estimate.of, SEEN), at.node,
+        at.share if is_smoothed else np.zeros(len(at.share)), R, turn, v_seen_mps, at.t_cam_s - run.t_mid_s,
+        arm_m, _bridge(problem, b, at, is_smoothed=is_smoothed), common,
     )  # fmt: skip
-    _add_bridge(P, problem, b, at, is_smoothed=is_smoothed)
-    P = P + common
-    R_t, omega = at.state.R, at.omega_radps
-    v_out = at.state.x[:, VEL] - np.einsum("nij,nj->ni", R_t, np.cross(omega, run.lever_arm_m))
-
-    P = 0.5 * (P + np.swapaxes(P, 1, 2))
-    P[:, 3:] *= 1e3
-    P[:, :, 3:] *= 1e3
     flags = _flags(run, at.t_cam_s, at.t_s, seen_cam_s, settings)
     flags[at.is_outside] |= int(PoseFlag.EXTRAPOLATED)
     variance = np.diagonal(P, axis1=1, axis2=2)
@@ -84,13 +66,12 @@ def sample_motion(
     # What rounding has made less than nothing says nothing.
     lost = at.is_outside | unsure | ~are_definite(P)
     flags[lost] |= int(PoseFlag.NO_POSE)
-    t_mm, v_mmps = 1e3 * p_out, 1e3 * v_out
-    R_out, omega = R_out.copy(), omega.copy()
-    for values in (R_out, t_mm, omega, v_mmps, P):
+    t_mm, omega, v_mmps = 1e3 * p_m, at.omega_radps, 1e3 * v_mps
+    for values in (R, t_mm, omega, v_mmps, P):
         values[lost] = np.nan
     track = FusedTrack(
         t_ns=output_t_ns,
-        R_camera_brick=R_out,
+        R_camera_brick=R,
         t_camera_brick_mm=t_mm,
         omega_brick_radps=omega,
         v_camera_mmps=v_mmps,
@@ -108,7 +89,7 @@ def sample_poses(
     As by `sample_motion`, whether sure or not; NaN beyond the nodes.
     """
     at = _carry(run, nodes, states, b, t_ns, is_smoothed=True)
-    R, p_m = at.state.R, at.state.x[:, POS] - at.state.R @ run.lever_arm_m
+    R, p_m = at.R, at.p_m - at.R @ run.lever_arm_m
     if run.camera is not None:
         R, p_m = run.camera.from_still(at.t_s, R, p_m)
     R[at.is_outside], p_m[at.is_outside] = np.nan, np.nan
@@ -129,8 +110,8 @@ class _Carried:
         The one before.
     since_s, share : ndarray, shape (n,)
         Time since then, and over the whole step.
-    state : State, leading shape (n,)
-    omega_radps : ndarray, shape (n, 3)
+    R, p_m, v_mps, omega_radps : ndarray, shape (n, 3, 3), (n, 3) each
+        Of the IMU point; the rate without its bias.
     """
 
     t_cam_s: FloatArray
@@ -139,7 +120,9 @@ class _Carried:
     node: IntArray
     since_s: FloatArray
     share: FloatArray
-    state: State
+    R: FloatArray
+    p_m: FloatArray
+    v_mps: FloatArray
     omega_radps: FloatArray
 
 
@@ -151,50 +134,22 @@ def _carry(run: Run, nodes: Nodes, states: State, b: int, t_ns: IntArray, *, is_
     outside = (t < nodes.t_s[0] - _SLACK_S) | (t > nodes.t_s[-1] + _SLACK_S)
     t = np.clip(t, nodes.t_s[0], nodes.t_s[-1])
     k = np.clip(np.searchsorted(nodes.t_s, t, side="right") - 1, 0, len(nodes.t_s) - 2)
-    x = states.x[k, b]
-    start_s, span = nodes.t_s[k], nodes.t_s[k + 1] - nodes.t_s[k]
-    since = t - start_s
-    R, v, p = _carried(run, State(states.R[k, b], x), start_s, t, float(x0[LAG]))
-    if is_smoothed:
-        miss_turn, miss_v, miss_p = _misses(run, nodes, states, b, k)
-        s, a = span[:, None], (since / span)[:, None]
-        R = R @ matrix_from_rvec(a * miss_turn)
-        p = p + (3 * a**2 - 2 * a**3) * miss_p + s * (a**3 - a**2) * miss_v
-        v = v + 6 * (a - a**2) / s * miss_p + (3 * a**2 - 2 * a) * miss_v
-    omega = run.signal.gyro_at(t) - x[:, BG]
-    x[:, POS], x[:, VEL] = p, v
-    return _Carried(t_cam, t, outside, k, since, since / span, State(R, x), omega)
-
-
-def _carried(
-    run: Run, start: State, start_s: FloatArray, end_s: FloatArray, lag_s: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return attitude, velocity and position to which the inertial samples carry states, shape (n,)."""
-    x, R, h = start.x, start.R, (end_s - start_s)[:, None]
-    part = run.signal.increments(
-        start_s, end_s, gyro_bias_radps=x[:, BG], acc_bias_mps2=x[:, BA], acc_lag_s=lag_s
-    )
-    v = x[:, VEL] + h * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dv_mps)
-    p = x[:, POS] + h * x[:, VEL] + 0.5 * h**2 * x[:, GRAV] + np.einsum("nij,nj->ni", R, part.dp_m)
+    start_s, n = nodes.t_s[k], len(t)
+    since, lag_s = t - start_s, float(x0[LAG])
+    felt = felt_over_steps = np.zeros((0, 2, 3))
     if run.camera is not None:
-        felt = run.camera.increments(start_s, end_s, acc_lag_s=lag_s)
-        v, p = v + felt[:, 0], p + felt[:, 1]
-    return R @ part.R, v, p
-
-
-def _misses(
-    run: Run, nodes: Nodes, state: State, b: int, k: IntArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return turn, velocity and position from where the samples carry nodes ``k`` to the nodes after them.
-
-    Many instants lie in one step, whose miss is theirs.
-    """
-    step, of = np.unique(k, return_inverse=True)
-    start = State(state.R[step, b], state.x[step, b])
-    R, v, p = _carried(run, start, nodes.t_s[step], nodes.t_s[step + 1], float(state.x[0, b, LAG]))
-    after_R, after_x = state.R[step + 1, b], state.x[step + 1, b]
-    turn = rvec_from_matrix(np.swapaxes(R, 1, 2) @ after_R)
-    return turn[of], (after_x[:, VEL] - v)[of], (after_x[:, POS] - p)[of]
+        felt, felt_over_steps = (
+            run.camera.increments(*ends, acc_lag_s=lag_s)[:, :2]
+            for ends in ((start_s, t), (nodes.t_s[:-1], nodes.t_s[1:]))
+        )
+    path = Path(
+        nodes.t_s, np.ascontiguousarray(states.R[:, b]), np.ascontiguousarray(states.x[:, b]),
+        run.signal.pieces(), lag_s, np.ascontiguousarray(felt_over_steps),
+    )  # fmt: skip
+    R, p_m, v_mps, omega_radps = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    carry_between(path, t, k, np.ascontiguousarray(felt), is_smoothed, R, p_m, v_mps, omega_radps)
+    share = since / (nodes.t_s[k + 1] - start_s)
+    return _Carried(t_cam, t, outside, k, since, share, R, p_m, v_mps, omega_radps)
 
 
 def common_part(run: Run, scale: FloatArray, share: float) -> FloatArray:
@@ -263,14 +218,12 @@ def unsure_times(
     return covariance, flags
 
 
-def _add_bridge(P: FloatArray, problem: Problem, b: int, at: _Carried, *, is_smoothed: bool) -> None:
-    """Add what inertial noise makes unsure between two known nodes (or after one), in place."""
-    left = 1 - at.share if is_smoothed else 1.0
+def _bridge(problem: Problem, b: int, at: _Carried, *, is_smoothed: bool) -> FloatArray:
+    """Return the variance that inertial noise adds between known nodes, or after one: (n, 2), rad^2, m^2."""
+    left = 1 - at.share if is_smoothed else np.ones(len(at.share))
     turn = problem.gyro_var[at.node, b] * at.since_s * left
     shift = problem.acc_var[at.node, b] * at.since_s**3 / 3 * left**3
-    i = np.arange(3)
-    P[:, i, i] += turn[:, None]
-    P[:, 3 + i, 3 + i] += shift[:, None]
+    return np.stack([turn, shift], axis=1)
 
 
 def _near_sample(signal: ImuSignal, t_s: FloatArray, marked: BoolArray) -> BoolArray:

@@ -38,6 +38,7 @@ from bricktrack_host.fusion.smoothing.smoother import (
     Filter,
     Problem,
 )
+from bricktrack_host.fusion.smoothing.standing_doubt import Doubt
 
 _FIRST_FRAMES = 15
 _FIRST_WITHIN_RAD = 0.3
@@ -65,6 +66,8 @@ class Smoothed:
         Of gyro and accelerometer.
     chi2 : ndarray, shape (n_frames,)
         Of each frame by all others.
+    doubt : Doubt or None
+        What of the covariance comes from errors that stand still.
     """
 
     run: Run
@@ -78,6 +81,7 @@ class Smoothed:
     scale: FloatArray
     levels: tuple[NoiseLevel, NoiseLevel]
     chi2: FloatArray
+    doubt: Doubt | None
 
 
 def smooth_poses(
@@ -117,12 +121,14 @@ def smooth_poses(
             break
         used = judged
         problem = with_frames_used(problem, nodes, used)
-    estimate = with_sensor_doubt(
+    estimate, doubts = with_sensor_doubt(
         problem, passed, estimate, [run.sensor_covariance for run in runs],
         R_still_camera=[node.camera_attitudes(run) for node, run in zip(nodes, runs, strict=True)],
     )  # fmt: skip
     return [
-        Smoothed(run, node, lin, problem, passed, estimate, b, used[b], scales[b], levels[b], chi2[b])
+        Smoothed(
+            run, node, lin, problem, passed, estimate, b, used[b], scales[b], levels[b], chi2[b], doubts[b]
+        )
         for b, (run, node, lin) in enumerate(zip(runs, nodes, lins, strict=True))
     ]
 

@@ -123,13 +123,16 @@ class CameraWay:
         own[:, 3:, ARM] = R_still_camera
         return own
 
-    def of_output(self, R_still_brick: FloatArray, p_still_m: FloatArray, of: IntArray) -> FloatArray:
-        """Return what they change between the states ``of`` and the motion as the camera sees it, (K, c, 23).
+    def of_output(
+        self, R_still_brick: FloatArray, p_still_m: FloatArray, of: IntArray, t_s: FloatArray
+    ) -> FloatArray:
+        """Return what they change between the states ``of`` and the motion as the camera sees it, (n, c, 23).
 
-        The camera is turned and shifted in the still axes; the states are told in these.
+        At instants after the first node, shape (n,). The camera is turned and shifted in the still axes; the
+        states are told in these.
         """
         out = np.zeros((len(R_still_brick), len(of), N_CAMERA_ERRORS))
-        seen = self.of_seen(R_still_brick, p_still_m, self.t_s)
+        seen = self.of_seen(R_still_brick, p_still_m, t_s)
         turn, place = (np.searchsorted(of, np.arange(part.start, part.stop)) for part in (ATT, POS))
         out[:, turn], out[:, place] = -seen[:, :3], -seen[:, 3:]
         return out

@@ -13,25 +13,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_common.rotations import skew
+from bricktrack_common.arrays import FloatArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
-from bricktrack_host.fusion.smoothing.camera_errors import CameraErrors, CameraWay, camera_prior_sd
-from bricktrack_host.fusion.smoothing.sensor_errors_kernel import carry_back, carry_forward
-from bricktrack_host.fusion.smoothing.smoother import (
-    BG,
-    POS,
-    SKEW,
-    TAU,
-    Estimate,
-    Filter,
-    Problem,
-    State,
-    residuals_of,
+from bricktrack_host.fusion.smoothing.camera_errors import (
+    N_CAMERA_ERRORS,
+    CameraErrors,
+    CameraWay,
+    camera_prior_sd,
 )
+from bricktrack_host.fusion.smoothing.smoother import Estimate, Filter, Problem
+from bricktrack_host.fusion.smoothing.standing_doubt import ARM, Doubt, ErrorWay, root_of
+from bricktrack_host.fusion.smoothing.standing_errors_kernel import N_GAINS, Sight
 
-N_ERRORS = 21
-_GAINS, _ARM = slice(0, 18), slice(18, N_ERRORS)
+N_ERRORS = ARM.stop
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,46 +56,22 @@ def sensor_prior_sd(settings: FusionSettings) -> FloatArray:
     return np.repeat([settings.sensor_gain_sd, settings.lever_arm_sd_mm * 1e-3], [18, 3])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Way:
-    """One run's way forwards: frames at nodes ``at``, and how errors change what is predicted.
-
-    Attitude R, rows of the covariance, and derivatives of the states wanted, ``changed``, are of all nodes.
-    """
-
-    at: IntArray
-    R: FloatArray
-    rows: FloatArray
-    y: FloatArray
-    H: FloatArray
-    S: FloatArray
-    gain: FloatArray
-    changed: FloatArray
-    dy: FloatArray
-
-
-def _way(problem: Problem, passed: Filter, b: int, *, of: IntArray, camera: CameraWay | None = None) -> _Way:
-    at = np.flatnonzero(problem.has_frame[:, b])
-    before = passed.predicted(at, b, of=of)
-    R, x = before.R[at], before.x
-    y, H = residuals_of(problem, State(R, x), at, b)
-    HP = H @ before.P
-    S = HP @ np.swapaxes(H, 1, 2) + problem.cov_seen[at, b] * passed.inflation[at, b][:, None, None]
-    gain = np.ascontiguousarray(np.swapaxes(np.linalg.solve(S, HP), 1, 2))
-    # The frame's own part: what it says of the origin depends on the arm to the sensor.
-    since_mid = problem.since_mid_s[at, b]
-    ahead = (x[:, TAU] - problem.tau_lin[b]) + since_mid * (x[:, SKEW] - problem.skew_lin[b])
-    own = np.zeros((len(at), 6, N_ERRORS))
-    turn = problem.omega_radps[at, b] - x[:, BG]
-    own[:, 3:, _ARM] = R + R @ skew(turn) * ahead[:, None, None]
-    further = np.zeros((len(problem.dt_s), 3, 0))
+def _way(problem: Problem, passed: Filter, b: int, R_still_camera: FloatArray | None) -> ErrorWay:
+    """Return the run's way over its frames; what these say of the origin depends on the arm to the sensor."""
+    camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, b)
+    has_frame = problem.has_frame[:, b]
+    at = np.flatnonzero(has_frame)
+    arm, last = np.zeros((len(at), 6, 3)), np.zeros((len(at), 6, 0))
+    arm[:, 3:] = R = problem.R_seen[at, b]
     if camera is not None:
-        theirs = camera.of_seen(R, problem.p_seen_m[at, b], camera.t_s[at])
-        own = np.concatenate([own, theirs], axis=2)
-        further = np.ascontiguousarray(camera.velocity)
-    H = np.ascontiguousarray(H)
-    changed, dy = carry_forward(passed.runs[b], at, before.R, H, gain, own, further, of)
-    return _Way(at, before.R, before.rows, y, H, S, gain, changed, dy)
+        last = camera.of_seen(R, problem.p_seen_m[at, b], camera.t_s[at])
+    sight = Sight(
+        first=np.append(0, np.cumsum(has_frame, dtype=np.int64)),
+        use=np.ones(len(at), dtype=np.bool_),
+        shared=arm, by_view=np.zeros((len(at), 0)), led=np.zeros(len(at), dtype=np.int64), n_leds=0,
+        last=last,
+    )  # fmt: skip
+    return ErrorWay.of(passed, b, sight, camera)
 
 
 def estimate_sensor_errors(
@@ -123,25 +93,22 @@ def estimate_sensor_errors(
     R_still_camera : ndarray, shape (K, 3, 3), optional
         Attitudes of a moving camera at the run's nodes.
     """
-    camera = None if R_still_camera is None else CameraWay.of(problem, R_still_camera, b)
     prior_sd = sensor_prior_sd(settings)
-    if camera is not None:
+    if R_still_camera is not None:
         prior_sd = np.append(prior_sd, camera_prior_sd(settings))
     believed = prior_sd > 0
     if not believed.any() or not problem.has_frame[:, b].any():
         return None
-    way = _way(problem, passed, b, of=np.zeros(0, dtype=np.int64), camera=camera)
-    dy = way.dy[..., believed]
-    weighted = np.linalg.solve(way.S, dy)
-    normal = np.einsum("nij,nik->jk", dy, weighted) + np.diag(prior_sd[believed] ** -2)
+    way, part = _way(problem, passed, b, R_still_camera), np.ix_(believed, believed)
+    normal = way.normal[part] + np.diag(prior_sd[believed] ** -2)
     errors, covariance = np.zeros(len(prior_sd)), np.zeros((len(prior_sd), len(prior_sd)))
-    covariance[np.ix_(believed, believed)] = np.linalg.inv(normal)
-    errors[believed] = -np.linalg.solve(normal, np.einsum("nij,ni->j", weighted, way.y))
-    gyro, acc = errors[_GAINS].reshape(2, 3, 3)
-    found = SensorErrors(gyro, acc, errors[_ARM], covariance)
-    if camera is None:
+    covariance[part] = np.linalg.inv(normal)
+    errors[believed] = -np.linalg.solve(normal, way.pull[believed])
+    gyro, acc = errors[:N_GAINS].reshape(2, 3, 3)
+    found = SensorErrors(gyro, acc, errors[ARM], covariance)
+    if R_still_camera is None:
         return found
-    return replace(found, camera=CameraErrors.of(errors[N_ERRORS:]))
+    return replace(found, camera=CameraErrors.of(errors[-N_CAMERA_ERRORS:]))
 
 
 def with_sensor_doubt(
@@ -151,39 +118,18 @@ def with_sensor_doubt(
     sensor_covariance: list[FloatArray],
     *,
     R_still_camera: list[FloatArray | None] | None = None,
-) -> Estimate:
+) -> tuple[Estimate, list[Doubt | None]]:
     """Return smoothed states with what the errors of the sensors leave unsure added to their covariance.
+
+    And this doubt of each run, None where all is known.
 
     ``sensor_covariance``: of each run of the batch, shape (21, 21), or (44, 44) where the camera moves; zero
     where all is known. ``R_still_camera``: as `estimate_sensor_errors`, of each run whose camera moves.
     """
-    covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
-    doubt = np.zeros((*covariance.shape[:3], max(len(unsure) for unsure in sensor_covariance)))
+    doubts: list[Doubt | None] = [None] * len(sensor_covariance)
     for b, unsure in enumerate(sensor_covariance):
-        if not unsure.any():
-            continue
-        still = None if R_still_camera is None else R_still_camera[b]
-        camera = None if still is None else CameraWay.of(problem, still, b)
-        way = _way(problem, passed, b, of=estimate.of, camera=camera)
-        weighted = np.linalg.solve(way.S, way.dy)
-        changed = way.changed
-        carry_back(passed.runs[b], way.at, way.R, way.H, way.gain, weighted, way.rows, changed)
-        # The origin is known as well as before: what an error of the arm moves is the point of the IMU.
-        at_arm = np.arange(_ARM.start, _ARM.stop)
-        changed[:, np.searchsorted(estimate.of, np.arange(POS.start, POS.stop))[:, None], at_arm] -= way.R
-        if camera is not None:
-            changed[:, :, N_ERRORS:] += camera.of_output(
-                estimate.state.R[:, b], estimate.state.x[:, b, POS], estimate.of
-            )
-        of_run = changed @ root_of(unsure)
-        doubt[:, b, :, : len(unsure)] = of_run
-        more = of_run @ np.swapaxes(of_run, 1, 2)
-        covariance[:, b] += more
-        variance[:, b, estimate.of] += np.diagonal(more, axis1=1, axis2=2)
-    return replace(estimate, covariance=covariance, variance=variance, doubt=doubt)
-
-
-def root_of(covariance: FloatArray) -> FloatArray:
-    """Return A with A A^T = covariance, which may lack rank; shape (q, q)."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+        if unsure.any():
+            still = None if R_still_camera is None else R_still_camera[b]
+            doubts[b] = doubt = Doubt(_way(problem, passed, b, still), root_of(unsure), estimate.of)
+            estimate = doubt.added_to(estimate, b)
+    return estimate, doubts

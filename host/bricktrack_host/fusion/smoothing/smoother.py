@@ -127,9 +127,6 @@ class Estimate:
         Innovation squared over its covariance (6 degrees of freedom), NaN where no frame; only of the filter.
     led_residual_px, led_cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
         Of each LED at the state of its node: seen less predicted, and H P H^T; empty where there are no LEDs.
-    doubt : ndarray, shape (K, B, c, q), or None
-        Of errors that stand still, in q independent parts, where ``covariance`` holds them too: what one sd
-        of each moves the states ``of`` by, over the whole run.
     """
 
     state: State
@@ -139,25 +136,6 @@ class Estimate:
     nis: FloatArray
     led_residual_px: FloatArray
     led_cov_px2: FloatArray
-    doubt: FloatArray | NDArray[np.float32] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Predicted:
-    """What the filter predicts of one run, before it takes in what was seen.
-
-    Attributes
-    ----------
-    R, rows : ndarray, shape (K, 3, 3), (K, c, 22)
-        Attitude at all nodes, and some rows of the covariance: the whole of it would be 4 kB a node.
-    x, P : ndarray, shape (n, 22), (n, 22, 22)
-        At the nodes asked for.
-    """
-
-    R: FloatArray
-    rows: FloatArray
-    x: FloatArray
-    P: FloatArray
 
 
 def _matvec(A: FloatArray, v: FloatArray) -> FloatArray:
@@ -275,23 +253,11 @@ class Filter:
         nis = self.nis[:, b] if leds is None else leds.nis[leds.use]
         return float(np.nanmean(nis)) if np.isfinite(nis).any() else float("nan")
 
-    def predicted(self, at: IntArray, b: int, *, of: IntArray) -> "Predicted":
-        """Return what the filter predicts of one run, before what was seen; the whole at rising nodes ``at``.
-
-        ``of``: the states of whose covariance the rows are wanted at all nodes.
-        """
-        n_nodes = len(self.nis)
-        predicted = Predicted(
-            R=np.empty((n_nodes, 3, 3)),
-            rows=np.empty((n_nodes, len(of), N_STATES)),
-            x=np.empty((len(at), N_STATES)),
-            P=np.empty((len(at), N_STATES, N_STATES)),
-        )
-        predict(
-            self.runs[b], *self._noise_of(b), *_start_of(self._problem, b), np.asarray(at, dtype=np.int64),
-            np.asarray(of, dtype=np.int64), predicted.R, predicted.rows, predicted.x, predicted.P,
-        )  # fmt: skip
-        return predicted
+    def predicted(self, b: int) -> FloatArray:
+        """Return the covariance of one run's nodes before what was seen there, shape (K, 22, 22)."""
+        P = np.empty((len(self.nis), N_STATES, N_STATES))
+        predict(self.runs[b], *self._noise_of(b), *_start_of(self._problem, b), P)
+        return P
 
     def forward(self, of: IntArray = SEEN) -> Estimate:
         """Return the filtered states: each knows only the past."""

@@ -298,28 +298,14 @@ def predict(
     R: FloatArray,
     x: FloatArray,
     P_start: FloatArray,
-    at: IntArray,
-    of: IntArray,
-    R_out: FloatArray,
-    rows_out: FloatArray,
-    x_out: FloatArray,
     P_out: FloatArray,
 ) -> None:
-    """Write what the filter predicts of each node, before it takes in what was seen there.
-
-    Attitude and rows ``of`` of the covariance of all nodes, shape (K, 3, 3) and (K, c, 22); state and
-    covariance of the nodes ``at``, rising, shape (n, 22) and (n, 22, 22).
-    """
-    n_nodes, i, P = len(run.has_frame), 0, P_start.ravel()
+    """Write the covariance of each node before what was seen there is taken in, shape (K, 22, 22)."""
+    n_nodes, P = len(run.has_frame), P_start.ravel()
     nis, inflation, nothing = np.empty(n_nodes), np.empty(n_nodes), room_for(0, 0)
     room = room_to_work()
     for k in range(n_nodes):
         if k > 0 and run.dt_s[k - 1] > 0.0:
             move_to(run, k, gyro_var[k - 1], acc_var[k - 1], R, x, P, room.F, room.F_flat, room.FP)
-        R_out[k] = R
-        for c in range(len(of)):
-            rows_out[k, c] = P[of[c] * N : (of[c] + 1) * N]
-        if i < len(at) and at[i] == k:
-            x_out[i], P_out[i] = x, P.reshape((N, N))
-            i += 1
+        P_out[k] = P.reshape((N, N))
         take_in(run, k, R, x, P, nis, inflation, room, nothing, 0)
