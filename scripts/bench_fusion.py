@@ -2,7 +2,7 @@
 
 The recordings are those of ``broad_windows.py`` (BROAD, CC BY 4.0; simulated camera noise and sensor).
 
-Run: ``python scripts/bench_fusion.py $BRICKTRACK_SAMPLES/fusion --seeds 3``; with ``--gtsam``, batch
+Run: ``python scripts/bench_fusion.py --seeds 3``; with ``--gtsam``, batch
 optimisation by GTSAM stands beside (half a minute a case; ``pip install gtsam``).
 """
 
@@ -16,12 +16,19 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import astuple, dataclass
-from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before NumPy is loaded
 
 import numpy as np
-from broad_windows import CAMERA_EPOCH_NS, LEVER_ARM_MM, Case, Recipe, make_case
+from broad_windows import (
+    CAMERA_EPOCH_NS,
+    LEVER_ARM_MM,
+    Case,
+    Recipe,
+    add_windows_argument,
+    make_case,
+    windows_in,
+)
 from rich.console import Console
 from rich.table import Table
 from scipy.interpolate import CubicSpline
@@ -161,7 +168,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path, help="the folder of the windows (*.npz)")
+    add_windows_argument(parser)
     parser.add_argument("--seeds", type=int, default=1, help="cases made of each window")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--lags", action="store_true", help="keep the sensor's native lags")
@@ -185,9 +192,9 @@ def main() -> None:
     )
     if args.gtsam and importlib.util.find_spec("gtsam") is None:
         parser.error("--gtsam needs the package gtsam, which is not installed: pip install gtsam")
-    paths = sorted(args.folder.glob("*.npz"))
+    paths = windows_in(args.folder, parser)
     if not paths:
-        parser.error(f"no *.npz in {args.folder}")
+        return
     if args.batch:
         cases = [make_case(p, seed=s, recipe=recipe) for p in paths for s in range(4)]
         seconds, busy_s, megabytes = time_batch(cases, runs=args.batch, workers=args.workers)

@@ -11,16 +11,15 @@ clocks). For each window: the error of the offset, its mean and scatter over the
   reference and the recorded sensor differ by, after the one constant lag that the windows' README takes out
   of all. It counts as an error of every method.
 
-Run: ``python scripts/bench_offset.py $BRICKTRACK_SAMPLES/fusion --seeds 8``
+Run: ``python scripts/bench_offset.py --seeds 8``
 """
 
 import argparse
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from broad_windows import LEVER_ARM_MM, Case, Recipe, make_case
+from broad_windows import LEVER_ARM_MM, Case, Recipe, add_windows_argument, make_case, windows_in
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -138,15 +137,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path, help="the folder of the windows (*.npz)")
+    add_windows_argument(parser)
     parser.add_argument("--seeds", type=int, default=8, help="cases made of each window, two at least")
     args = parser.parse_args()
     logging.getLogger("bricktrack_host").setLevel(logging.ERROR)  # the hidden offset is known to be there
     if args.seeds < 2:
         parser.error("a scatter needs --seeds 2 or more")
-    paths = sorted(args.folder.glob("*.npz"))
+    paths = windows_in(args.folder, parser)
     if not paths:
-        parser.error(f"no *.npz in {args.folder}")
+        return
     table = Table(title="offset of the clocks, ms (BROAD, CC BY 4.0; simulated camera and clocks)")
     for column in ("window", "aligned", "mean", "scatter", "rms", "stated", "bound", "own"):
         table.add_column(column, justify="left" if column == "window" else "right")

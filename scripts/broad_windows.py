@@ -6,6 +6,8 @@ skew, an unknown direction of gravity, and inertial signals made BNO055-like (si
 motion). Every random choice comes from the seed, so that other seeds are other data.
 """
 
+import argparse
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,6 +73,26 @@ class Case:
     in_dropout: BoolArray
     R_clean: FloatArray
     t_clean_mm: FloatArray
+
+
+def add_windows_argument(parser: argparse.ArgumentParser) -> None:
+    """Let a benchmark be given the folder of the windows."""
+    parser.add_argument(
+        "folder", type=Path, nargs="?", help="of the windows (*.npz); default: $BRICKTRACK_SAMPLES/fusion"
+    )
+
+
+def windows_in(folder: Path | None, parser: argparse.ArgumentParser) -> list[Path]:
+    """Return the windows' files; none, and a word, where no folder is given and none known."""
+    if folder is None:
+        if not (root := os.environ.get("BRICKTRACK_SAMPLES")):
+            print("BRICKTRACK_SAMPLES is not set: no recorded windows")
+            return []
+        folder = Path(root) / "fusion"
+    paths = sorted(folder.glob("*.npz"))
+    if not paths:
+        parser.error(f"no *.npz in {folder}")
+    return paths
 
 
 def _dropouts(rng: np.random.Generator, n: int, t_end_s: float) -> list[tuple[float, float]]:

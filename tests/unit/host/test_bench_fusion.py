@@ -1,11 +1,12 @@
 """How the fusion benchmark makes its cases, and what stands beside it."""
 
+from argparse import ArgumentParser
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from brick_shakes import LEVER_ARM_MM, simulate_shake
-from broad_windows import Recipe, cleaned_reference, make_case
+from broad_windows import Recipe, cleaned_reference, make_case, windows_in
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.clocks.time_alignment import align_times
@@ -47,6 +48,20 @@ def test_a_range_is_set_by_the_share_of_samples_beyond_it(tmp_path):
     # The limit itself is the sample at that quantile; steps of 0.01 m/s^2 put few others on it.
     assert at_limit.mean() == pytest.approx(0.05, abs=0.005)
     assert np.abs(case.imu.acc_mps2).max() <= case.imu.acc_range_mps2 < 20
+
+
+def test_windows_come_from_the_samples_where_no_folder_is_given(tmp_path, monkeypatch, capsys):
+    parser = ArgumentParser()
+    monkeypatch.delenv("BRICKTRACK_SAMPLES", raising=False)
+    assert windows_in(None, parser) == []
+    assert "BRICKTRACK_SAMPLES is not set" in capsys.readouterr().out
+    (tmp_path / "fusion").mkdir()
+    monkeypatch.setenv("BRICKTRACK_SAMPLES", str(tmp_path))
+    with pytest.raises(SystemExit):
+        windows_in(None, parser)
+    window = tmp_path / "fusion" / "dev_made.npz"
+    window.touch()
+    assert windows_in(None, parser) == windows_in(tmp_path / "fusion", parser) == [window]
 
 
 def test_gtsam_finds_the_motion_of_a_simulated_shake():
