@@ -120,7 +120,7 @@ def solve_poses(
     torn, twist_doubt = np.zeros(n, dtype=np.bool_), np.zeros((n, 6))
     for _ in range(_PASSES):
         if not is_given:
-            motion = motion_to_leds(t_ns, led_t_ns, R, t_mm)
+            motion = _no_less_sure(motion_to_leds(t_ns, led_t_ns, R, t_mm), motion)
         n_before, n_torn = int(all_finite(uv).sum()), int(torn.sum())
         if motion is not None and motion.twist_sd is not None:
             motion = replace(motion, twist_sd=np.maximum(motion.twist_sd, twist_doubt))
@@ -169,6 +169,17 @@ def solve_poses(
     of_leds = standing_share(track.residual_px) * misfit * poses.by_centroids
     of_profile = poses.by_profile[:, :, None] * poses.by_profile[:, None, :]
     return replace(track, shared_covariance=of_leds + of_profile)
+
+
+def _no_less_sure(motion: LedMotion, before: LedMotion | None) -> LedMotion:
+    """Return a motion as sure as it was a pass before, where it was surer.
+
+    Poses with few LEDs scatter by what the motion leaves them free to, and motions by what poses scatter:
+    each pass would be less sure than the one before.
+    """
+    if before is None or before.twist_sd is None or motion.twist_sd is None:
+        return motion
+    return replace(motion, twist_sd=np.minimum(motion.twist_sd, before.twist_sd))
 
 
 def start_poses(
