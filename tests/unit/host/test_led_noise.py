@@ -21,6 +21,7 @@ def sightings(frame, led, u_px):
     m = len(frame)
     values = {
         "frame": np.array(frame), "led": np.array(led), "t_ns": np.arange(m), "spread_ns": np.zeros(m),
+        "exposure_ns": np.zeros(m, dtype=np.int64),
         "uv_px": np.stack([np.array(u_px, dtype=float), np.full(m, 500.0)], axis=1),
         "cov_px2": np.tile(1e-3 * np.eye(2), (m, 1, 1)),
     }  # fmt: skip

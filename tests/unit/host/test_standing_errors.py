@@ -18,7 +18,7 @@ from bricktrack_host.fusion.smoothing.smoother import POS, Filter
 from bricktrack_host.tracking.optical_track import solve_poses
 
 SETTINGS = FusionSettings()
-PROFILE, SPREAD, FIRST_LED, BY_VIEW = 21, 23, 24, 38
+PROFILE, SPREAD, SMEAR, FIRST_LED, BY_VIEW = 21, 23, 24, 25, 39
 
 
 def smoothed(run):
@@ -116,6 +116,27 @@ def test_what_acceleration_draws_centroids_by_is_not_told_but_makes_all_unsure(p
     off = (more - 0.4**2 * np.outer(wrong, wrong)) / np.outer(scale, scale)
     assert np.abs(off).max() < 0.01  # each LED moves the state at which the next is linearised
     assert np.max(np.abs(wrong[:21]) * 0.4 / scale[:21]) > 0.05  # the accelerometer's scale, for one
+
+
+def test_how_far_a_smear_draws_leaning_lights_is_found(plain):
+    # Centroids drawn by a fiftieth of their smear times how far their axes lean, as the last pass pictures it.
+    done, last = plain
+    problem, pictured, leds = last.states.problem, last.pictured, done.leds
+    n_views = done.errors.n_views
+
+    def errors(share):
+        seen = problem.leds.residual_px + share * pictured.leaning_px
+        drawn = replace(problem, leds=problem.leds._replace(residual_px=seen))
+        way = StandingWay(drawn, Filter(drawn), leds, pictured, 7, n_views=n_views)
+        prior = StandingPrior.of(leds, pictured, 7, SETTINGS, n_views=n_views, camera_moves=False)
+        return way.estimate(prior, np.zeros_like(done.errors.value))
+
+    none, drawn = errors(0.0), errors(0.02)
+    sd = np.sqrt(none.covariance[SMEAR, SMEAR])
+    assert sd < 0.005
+    assert abs(none.value[SMEAR]) < 3.5 * sd
+    # The prior of 0.01 keeps what its share of the information is.
+    assert drawn.value[SMEAR] - none.value[SMEAR] == pytest.approx(0.02 * (1 - (sd / 0.01) ** 2), rel=0.03)
 
 
 def test_the_likeliest_errors_are_those_of_the_dense_gaussian_formulas():

@@ -38,7 +38,7 @@ class SeenLeds:
     uv_px, cov_px2 : ndarray, shape (m, 2), (m, 2, 2)
     spread_ns : ndarray, shape (m,), ns
         Standard deviation of the instants at which its light was gathered: by exposure, and by its rows.
-    exposure_ns : ndarray, shape (m,), ns
+    exposure_ns : ndarray of int64, shape (m,), ns
     """
 
     frame: IntArray
@@ -47,7 +47,7 @@ class SeenLeds:
     uv_px: FloatArray
     cov_px2: FloatArray
     spread_ns: FloatArray
-    exposure_ns: FloatArray
+    exposure_ns: IntArray
 
     @classmethod
     def of(cls, observations: LedObservations, ray_model: RayModel) -> "SeenLeds":
@@ -64,7 +64,7 @@ class SeenLeds:
         row_ns = ray_model.sensor_mode.row_delay_ns(1.0) - ray_model.sensor_mode.row_delay_ns(0.0)
         spread_ns = np.hypot(observations.exposure_ns[frame] / np.sqrt(12), rows * row_ns)
         return cls(frame, led, t_ns[frame, led], observations.uv_px[frame, led],
-                   observations.cov_px2[frame, led], spread_ns, observations.exposure_ns[frame] * 1.0)  # fmt: skip
+                   observations.cov_px2[frame, led], spread_ns, observations.exposure_ns[frame])  # fmt: skip
 
     def take(self, rows: BoolArray) -> "SeenLeds":
         """Return some of the rows."""
@@ -138,6 +138,7 @@ def picture(
     prediction, before, after = (_predict(leds, R, t_mm, ray_model, brick) for R, t_mm in poses)
     mode = ray_model.sensor_mode
     mean_px = 0.5 * (before.uv_px + after.uv_px)
+    exposures = 0.5 * leds.exposure_ns / np.maximum(leds.spread_ns, 1.0)
     return Pictured(
         R_camera_brick=R_camera_brick[0],
         t_camera_brick_mm=t_camera_brick_mm[0],
@@ -149,9 +150,7 @@ def picture(
         from_side_rad=_from_side(leds, R_camera_brick[0], t_camera_brick_mm[0], brick),
         facing=prediction.facing,
         side_on_px=prediction.model_shift_px,
-        leaning_px=_leaning_px(
-            prediction, (after.uv_px - before.uv_px) * (0.5 * leds.exposure_ns / leds.spread_ns)[:, None]
-        ),
+        leaning_px=_leaning_px(prediction, (after.uv_px - before.uv_px) * exposures[:, None]),
     )
 
 

@@ -31,8 +31,8 @@ from bricktrack_host.fusion.smoothing.standing_doubt import ARM, Doubt, ErrorWay
 from bricktrack_host.fusion.smoothing.standing_errors_kernel import N_GAINS, Sight
 from bricktrack_host.tracking.pose.refine import OWN_SHARE
 
-_PROFILE, _SCALE, _SPREAD = range(N_ERRORS, N_ERRORS + 3)
-_FIRST_LED = N_ERRORS + 3
+_PROFILE, _SCALE, _SPREAD, _SMEAR = range(N_ERRORS, N_ERRORS + 4)
+_FIRST_LED = N_ERRORS + 4
 N_VIEWS = 6  # see `_by_view`
 _N_LINEAR = 3
 _CURVED_TELLS = 0.2
@@ -46,6 +46,9 @@ pixel that is full counts no more light, and neither rim nor plateau counts all 
 another renderer with 6 to 12 ms of exposure 0.7 to 0.9 of it was left (simulated). The samples do not tell
 it, for their low-pass has the same shape; so it is not estimated, but leaves the motion unsure.
 """
+_SMEAR_SD = 0.01
+"""Of how far a smear draws a centroid aside, over the smear; see `led_measurements.Pictured.leaning_px`. By
+recording -0.003 to 0.016, in those of another renderer with 1 to 15 ms of exposure (simulated)."""
 _ALIKE_RAD = 0.2
 """Turned by so much, an LED's error is another one. In recordings by another renderer than this project's
 LEDs' errors changed by 5 to 10 times their size per radian (simulated)."""
@@ -59,13 +62,13 @@ another renderer than this project's had 1.4 times as much on the median (simula
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandingErrors:
-    """Errors that stand still, in one vector of q = 24 + 2 V L, or 47 + 2 V L where the camera moves.
+    """Errors that stand still, in one vector of q = 25 + 2 V L, or 48 + 2 V L where the camera moves.
 
     In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
     the profile's, in units of its stated sd; the picture's size over what it should be, less 1; how far
-    acceleration draws the centroid, likewise, which is not estimated and stays 0; (u, v) of each of L LEDs,
-    px, and V - 1 times as many that change with the view, see `_by_view`; those of the sensor that moves with
-    the camera, as in `CameraErrors.values`.
+    acceleration draws the centroid, likewise, which is not estimated and stays 0; how far the smear draws it,
+    over the smear; (u, v) of each of L LEDs, px, and V - 1 times as many that change with the view, see
+    `_by_view`; those of the sensor that moves with the camera, as in `CameraErrors.values`.
 
     Attributes
     ----------
@@ -168,7 +171,7 @@ class StandingPrior:
         q = by_view.stop + len(self.camera_sd)
         out = np.zeros((*np.shape(offset_sd_px), q, q))
         at = np.arange(q)
-        of_all = [1.0, _SCALE_SD**2, 0.0]
+        of_all = [1.0, _SCALE_SD**2, 0.0, _SMEAR_SD**2]
         out[..., at, at] = np.concatenate(
             [self.sensor_sd**2, of_all, np.zeros(self.n_views * own.size), self.camera_sd**2]
         )
@@ -275,8 +278,16 @@ def _by_view(pictured: Pictured, n_views: int) -> FloatArray:
 
 
 def _of_all_leds(pictured: Pictured) -> FloatArray:
-    """Return what each error that all LEDs share moves their centroids by, shape (m, 2, 3), px."""
-    return np.stack([pictured.profile_shift_px, pictured.from_centre_px, pictured.accelerated_px], axis=2)
+    """Return what each error that all LEDs share moves their centroids by, shape (m, 2, 4), px."""
+    return np.stack(
+        [
+            pictured.profile_shift_px,
+            pictured.from_centre_px,
+            pictured.accelerated_px,
+            pictured.leaning_px,
+        ],
+        axis=2,
+    )
 
 
 def _likeliest(
