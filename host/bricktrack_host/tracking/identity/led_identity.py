@@ -196,8 +196,14 @@ def _verified(
     suspect = np.flatnonzero(rms > SUSPECT * median_filter(rms, NEAR_FRAMES, mode="nearest"))
     if suspect.size == 0:
         return verified
+    at, some = frames[suspect], lights.take(suspect)
     start = (verified.poses.R_camera_brick[suspect], verified.poses.t_camera_brick_mm[suspect])
-    return verified.replaced(suspect, _without_intruders(run, lights.take(suspect), start, frames[suspect]))
+    again = run.verify(some, start, intruders=True, n_lights=run.lights.count[at])
+    hit = np.flatnonzero(~(again.poses.chi2 <= _BELIEVED_CHI2))
+    if hit.size:
+        moving = _without_intruders(run, some.take(hit), (start[0][hit], start[1][hit]), at[hit])
+        again = again.replaced(hit, moving)
+    return verified.replaced(suspect, again)
 
 
 def _without_intruders(
