@@ -38,6 +38,7 @@ _EM_SHARE = 0.56  # mean width of a letter of such fonts
 
 _PT = 72.0  # an inch
 _SWATCH_PT = 16.0
+_FAR_PT = 1e4
 _X_MARGIN, _Y_MARGIN = 0.01, 0.05
 
 
@@ -221,9 +222,8 @@ class _Scales:
 
 
 def _whole(position_pt: FloatArray) -> IntArray:
-    # Far outside the panel is as good as a little outside; NaN is nowhere that anyone looks.
-    near: FloatArray = np.clip(np.where(np.isnan(position_pt), 0.0, position_pt), -1e4, 1e4)
-    return np.rint(near * UNITS_PER_PT).astype(np.int64)
+    # Far outside the panel is as good as a little outside, and for NaN, which nobody looks at.
+    return np.rint(np.fmin(np.fmax(position_pt, -_FAR_PT), _FAR_PT) * UNITS_PER_PT).astype(np.int64)
 
 
 def _panel_svg(panel: Panel, x_limits: tuple[float, float], number: int) -> str:

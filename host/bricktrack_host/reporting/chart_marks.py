@@ -15,8 +15,10 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 UNITS_PER_PT = 20
 _WORDS_PT = 8.5
 _NOWHERE = np.empty(0)
+_TEXT = "S8"
+"""Short pieces of ASCII side by side in an array, filled up with zero bytes."""
 _N_WRITTEN = 2048
-_WRITTEN = np.array([str(i) for i in (*range(_N_WRITTEN), *range(-_N_WRITTEN, 0))], dtype=object)
+_WRITTEN = np.array([str(i) for i in (*range(_N_WRITTEN), *range(-_N_WRITTEN, 0))], dtype=_TEXT)
 """Numbers as text, at their own index, which may be negative: a report holds 200,000, nearly all small."""
 
 ToPage = Callable[[FloatArray, FloatArray], IntArray]
@@ -335,7 +337,7 @@ def polyline(points: IntArray) -> str:
     steps = np.diff(points, axis=0)
     steps = steps[steps.any(axis=1)]
     u, v = points[0].tolist()
-    return f"M{u} {v}l0 0" if not len(steps) else f"M{u} {v}l{' '.join(_written(steps))}"
+    return f"M{u} {v}l0 0" if not len(steps) else f"M{u} {v}l{_repeated('%s %s ', steps)}"
 
 
 def _steps(points: IntArray) -> IntArray:
@@ -344,16 +346,12 @@ def _steps(points: IntArray) -> IntArray:
 
 def _repeated(pattern: str, rows: IntArray) -> str:
     """Return a pattern filled in with each row; at once, as there may be ten thousands."""
-    return (pattern * len(rows)) % tuple(_written(rows))
-
-
-def _written(numbers: IntArray) -> list[str]:
-    """Return all numbers of an array as text, row by row."""
-    flat = numbers.ravel()
-    if flat.size and (flat.min() < -_N_WRITTEN or flat.max() >= _N_WRITTEN):
-        return list(map(str, flat.tolist()))
-    written: list[str] = _WRITTEN[flat].tolist()
-    return written
+    between = pattern.split("%s")
+    parts = np.empty((len(rows), len(between) + rows.shape[1]), dtype=_TEXT)
+    parts[:, ::2] = between
+    are_small = not rows.size or (rows.min() >= -_N_WRITTEN and rows.max() < _N_WRITTEN)
+    parts[:, 1::2] = _WRITTEN[rows] if are_small else rows.astype(_TEXT)
+    return parts.tobytes().translate(None, b"\0").decode("ascii")
 
 
 def _runs(known: BoolArray) -> list[slice]:
