@@ -198,11 +198,26 @@ def test_a_daemon_that_hangs_is_ended_by_the_watchdog_and_started_anew(manager):
     assert before and {p: p.read_bytes() for p in before} == before
 
 
-def test_a_daemon_that_is_killed_is_started_anew(manager):
-    os.kill(manager.main_pid(), signal.SIGKILL)
+def test_a_daemon_that_is_killed_while_it_records_is_started_anew_and_has_the_run(manager):
+    before = set(RUNS.iterdir())
+    pid = manager.main_pid()
+    in_memory = Path(f"/proc/{pid}/root/run/bricktrack/black-box")
+    time.sleep(0.3)
+    wave = guest_knobs.square_wave(17, hz=20, n_periods=30)
+    deadline = time.monotonic() + 30
+    while not list(in_memory.glob("*/edges.msgpack")):
+        assert time.monotonic() < deadline, manager.log()
+        time.sleep(0.02)
+    os.kill(pid, signal.SIGKILL)
+    guest_knobs.rises_of(wave)
     manager.wait_for("NRestarts", "2")
     manager.wait_for("ActiveState", "active")
     manager.wait_for("StatusText", "armed")
+    (folder,) = set(RUNS.iterdir()) - before
+    manifest = read_manifest(folder / "manifest.json")
+    assert manifest.state == "interrupted" and manifest.trigger.t0_ns is not None
+    assert any("the daemon was killed" in words for words in manifest.missing), manifest.missing
+    assert manifest.quality.edges > 0 and manifest.quality.imu_slots > 0
 
 
 def test_stopping_it_is_clean_and_no_failure(manager):
@@ -211,4 +226,4 @@ def test_stopping_it_is_clean_and_no_failure(manager):
     assert manager.show("ExecMainStatus") == "0"
     assert "stopping" in manager.log()
     states = {json.loads(p.read_text())["state"] for p in RUNS.glob("*/manifest.json")}
-    assert states == {"complete"} and not list(RUNS.glob("*.partial"))
+    assert states == {"complete", "interrupted"} and not list(RUNS.glob("*.partial"))
