@@ -147,7 +147,7 @@ def _by_speed(
         for p in range(m):
             log_spread += _eliminate(B, p)
         by_speed[s + 1] = by_speed[0] - 0.5 * (log_spread + B[m, m])
-    return at_rest
+    return float(at_rest)
 
 
 @compiled_fast

@@ -20,11 +20,11 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import FloatArray, IntArray, as_float_array
 from bricktrack_common.brick_model import DEFAULT_SHIFT_SD_PER_RADIUS, BrickModel
 from bricktrack_common.camera_model import RayModel
-from bricktrack_common.rotations import skew
 from bricktrack_host.compiled import compiled
 from bricktrack_host.tracking.led_model.hit_polynomials import expand_at, hit_polynomials
 from bricktrack_host.tracking.led_model.led_outline import outline, outlines_of
 from bricktrack_host.tracking.led_model.led_view import AREA, N_SHAPE, led_shape, led_view
+from bricktrack_host.tracking.led_model.projection import project_points
 
 UNKNOWN_SHIFT_PER_RADIUS = 0.1
 """Standard deviation of the unknown shift, in LED radii times the sine of the view angle: between a bare
@@ -127,7 +127,7 @@ def predict_leds(
     radii = np.broadcast_to(given_radii, lead)
     outlines = outlines_of(given_radii.ravel(), collar_mm)
     kind = np.broadcast_to(outlines.kind.reshape(given_radii.shape), lead)
-    uv = ray_model.project(centres).uv_px
+    uv = project_points(centres, ray_model)
     polynomials = hit_polynomials(ray_model)
     hits = expand_at(polynomials, uv)
     a, b = polynomials.plane_a_mm, polynomials.plane_b_mm
@@ -210,11 +210,10 @@ def predict_brick(
     J_px_per_pose : ndarray, shape (n, n_leds, 2, 6)
         By ``[dtheta rad, dt mm]`` of `bricktrack_host.tracks`.
     """
-    R = R_camera_brick if R_camera_brick.ndim == 4 else R_camera_brick[:, None]
-    t = t_camera_brick_mm if t_camera_brick_mm.ndim == 3 else t_camera_brick_mm[:, None]
     P, N = brick_model.led_positions_mm, brick_model.led_axes
-    centres = np.einsum("nlij,lj->nli", np.broadcast_to(R, (R.shape[0], len(P), 3, 3)), P) + t
-    axes = np.einsum("nlij,lj->nli", np.broadcast_to(R, (R.shape[0], len(P), 3, 3)), N)
+    R = np.ascontiguousarray(R_camera_brick if R_camera_brick.ndim == 4 else R_camera_brick[:, None])
+    t = np.ascontiguousarray(t_camera_brick_mm if t_camera_brick_mm.ndim == 3 else t_camera_brick_mm[:, None])
+    centres, axes = _placed(R, t, P, N)
     prediction = predict_leds(
         centres,
         axes,
@@ -223,10 +222,48 @@ def predict_brick(
         collar_mm=collar_mm,
         shift_sd_per_radius=shift_per_radius(collar_mm, brick_model),
     )
-    J = np.empty((*centres.shape[:2], 2, 6))
-    J[..., :3] = -(prediction.J_px_per_mm @ (R @ skew(P)) + prediction.J_px_per_axis @ (R @ skew(N)))
-    J[..., 3:] = prediction.J_px_per_mm
-    return prediction, J
+    return prediction, _by_pose(R, P, N, prediction.J_px_per_mm, prediction.J_px_per_axis)
+
+
+@compiled
+def _placed(R: FloatArray, t: FloatArray, P: FloatArray, N: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return LEDs' centres and axes, (n, n_leds, 3), of poses (n, m, ...), one for all LEDs or each one's."""
+    n, n_leds = len(R), len(P)
+    centres, axes = np.empty((n, n_leds, 3)), np.empty((n, n_leds, 3))
+    for i in range(n):
+        for k in range(n_leds):
+            at, from_ = min(k, R.shape[1] - 1), min(k, t.shape[1] - 1)
+            for r in range(3):
+                x, y, z = R[i, at, r, 0], R[i, at, r, 1], R[i, at, r, 2]
+                centres[i, k, r] = x * P[k, 0] + y * P[k, 1] + z * P[k, 2] + t[i, from_, r]
+                axes[i, k, r] = x * N[k, 0] + y * N[k, 1] + z * N[k, 2]
+    return centres, axes
+
+
+@compiled
+def _by_pose(
+    R: FloatArray, P: FloatArray, N: FloatArray, J_centre: FloatArray, J_axis: FloatArray
+) -> FloatArray:
+    """Return derivatives of pixels by turn and shift, (n, n_leds, 2, 6), of those by centres and axes.
+
+    A turn theta, brick axes, moves a centre by R (theta x P): its row is P x (R' J).
+    """
+    n, n_leds = J_centre.shape[:2]
+    J = np.empty((n, n_leds, 2, 6))
+    c, a = np.empty(3), np.empty(3)
+    for i in range(n):
+        for k in range(n_leds):
+            M = R[i, min(k, R.shape[1] - 1)]
+            for row in range(2):
+                by, of_axis, out = J_centre[i, k, row], J_axis[i, k, row], J[i, k, row]
+                for r in range(3):
+                    c[r] = M[0, r] * by[0] + M[1, r] * by[1] + M[2, r] * by[2]
+                    a[r] = M[0, r] * of_axis[0] + M[1, r] * of_axis[1] + M[2, r] * of_axis[2]
+                    out[3 + r] = by[r]
+                out[0] = P[k, 1] * c[2] - P[k, 2] * c[1] + N[k, 1] * a[2] - N[k, 2] * a[1]
+                out[1] = P[k, 2] * c[0] - P[k, 0] * c[2] + N[k, 2] * a[0] - N[k, 0] * a[2]
+                out[2] = P[k, 0] * c[1] - P[k, 1] * c[0] + N[k, 0] * a[1] - N[k, 1] * a[0]
+    return J
 
 
 def collar_of(brick_model: BrickModel) -> float | None:
