@@ -335,7 +335,7 @@ def polyline(points: IntArray) -> str:
     if len(points) == 0:
         return ""
     steps = np.diff(points, axis=0)
-    steps = steps[steps.any(axis=1)]
+    steps = steps[(steps[:, 0] != 0) | (steps[:, 1] != 0)]  # `any` along so short an axis is slow
     u, v = points[0].tolist()
     return f"M{u} {v}l0 0" if not len(steps) else f"M{u} {v}l{_repeated('%s %s ', steps)}"
 
@@ -349,8 +349,10 @@ def _repeated(pattern: str, rows: IntArray) -> str:
     between = pattern.split("%s")
     parts = np.empty((len(rows), len(between) + rows.shape[1]), dtype=_TEXT)
     parts[:, ::2] = between
-    are_small = not rows.size or (rows.min() >= -_N_WRITTEN and rows.max() < _N_WRITTEN)
-    parts[:, 1::2] = _WRITTEN[rows] if are_small else rows.astype(_TEXT)
+    is_large = (rows < -_N_WRITTEN) | (rows >= _N_WRITTEN)
+    numbers = _WRITTEN[np.where(is_large, 0, rows)]
+    numbers[is_large] = rows[is_large].astype(_TEXT)
+    parts[:, 1::2] = numbers
     return parts.tobytes().translate(None, b"\0").decode("ascii")
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 
 N_COLUMNS = 1200
 """Pixels that a page gives the time axis, and a little more."""
@@ -35,14 +35,21 @@ def thinned(t_s: FloatArray, y: FloatArray, *, n_columns: int = N_COLUMNS) -> In
     if n <= 4 * n_columns or not t_s[-1] > t_s[0]:
         return np.arange(n, dtype=np.int64)
     column = pixel_columns(t_s, n_columns)
-    starts = np.flatnonzero(np.concatenate([[True], column[1:] != column[:-1]]))
-    ends = np.append(starts[1:], n)
-    by_value = np.lexsort((y, column))  # NaN last
-    keep = np.zeros(n, dtype=bool)
-    for chosen in (starts, ends - 1, by_value[starts], by_value[ends - 1]):
-        keep[chosen] = True
-    keep |= np.isin(column, column[np.isnan(y)])
+    is_first = _begins(column)
+    starts = np.flatnonzero(is_first)
+    of_column = np.cumsum(is_first) - 1
+    keep = is_first | np.append(is_first[1:], True)
+    for extreme in (np.minimum, np.maximum):  # NaN if one is among them
+        extremes = extreme.reduceat(y, starts)
+        at = np.flatnonzero(y == extremes[of_column])
+        keep[at[_begins(of_column[at])]] = True
+    keep |= np.isnan(extremes)[of_column]
     return np.asarray(np.flatnonzero(keep), dtype=np.int64)
+
+
+def _begins(column: IntArray) -> BoolArray:
+    """Return which samples are the first of their column."""
+    return np.asarray(np.diff(column, prepend=-1) != 0)
 
 
 def pixel_columns(t_s: FloatArray, n_columns: int) -> IntArray:
