@@ -18,6 +18,8 @@ from bricktrack_device.capture.recording import Recording
 from bricktrack_device.capture.room import memory_available_bytes
 from bricktrack_device.capture.saving import build_manifest, streams
 from bricktrack_device.config import DeviceConfig
+from bricktrack_device.storage.recovery import recover_runs
+from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME
 
 logger = logging.getLogger(__name__)
@@ -57,10 +59,10 @@ class BlackBox:
         """Of which run there is a copy; ``""`` if there is none."""
         return "" if self._run is None else self._run.name
 
-    @property
-    def holds_runs(self) -> bool:
-        """Whether there is a run that a daemon left."""
-        return self.folder is not None and self.folder.is_dir() and any(self.folder.iterdir())
+    def bring_in(self, store: RunStore) -> None:
+        """Put on the card what a daemon left that was killed; see `storage.recovery`."""
+        if self.folder is not None and self.folder.is_dir() and any(self.folder.iterdir()):
+            recover_runs(store, self.folder)
 
     def begin(self, run_id: str, video_bytes: int) -> None:
         """Copy this run from now on, if there is room for it in memory."""

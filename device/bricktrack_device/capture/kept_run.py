@@ -1,6 +1,7 @@
 """A recording from the moment it was made until it is on the card: nothing in between may lose it."""
 
 from bricktrack_common.errors import StorageError
+from bricktrack_device.capture.black_box import BlackBox
 from bricktrack_device.capture.recording import Recording
 from bricktrack_device.capture.saving import save
 from bricktrack_device.interfaces import Rig
@@ -19,11 +20,14 @@ class KeptRun:
     store : RunStore
     rig : Rig
         Knows the true motion of simulated runs.
+    black_box : BlackBox
+        Holds a copy until the run is on the card.
     """
 
-    def __init__(self, store: RunStore, rig: Rig) -> None:
+    def __init__(self, store: RunStore, rig: Rig, black_box: BlackBox) -> None:
         self._store = store
         self._rig = rig
+        self._black_box = black_box
         self._kept: tuple[Recording, RunWriter] | None = None
 
     @property
@@ -34,6 +38,14 @@ class KeptRun:
     def keep(self, recording: Recording) -> None:
         """Hold a recording until it is saved."""
         self._kept = recording, self._store.open_writer(recording.run_id)
+        self._black_box.take(lambda: recording)
+
+    @property
+    def fate(self) -> str:
+        """What becomes of the run where the daemon ends before it is saved, in words."""
+        if self.run_id == self._black_box.run_id:
+            return "not on the card; a copy in memory waits for the next start"
+        return "lost from memory; its folder holds what was saved"
 
     def has_room(self) -> bool:
         """Tell whether saving it is worth another try; a card that does not say how full it is has none."""
@@ -62,4 +74,5 @@ class KeptRun:
             lambda folder: self._rig.write_truth(folder, start_ns=start_ns, end_ns=end_ns),
         )
         self._kept = None
+        self._black_box.forget()
         return recording

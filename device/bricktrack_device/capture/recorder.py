@@ -32,7 +32,6 @@ from bricktrack_device.capture.state_table import Cause, StateMachine
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.refusals import RequestRefusedError
-from bricktrack_device.storage.recovery import recover_runs
 from bricktrack_device.storage.run_store import RunStore
 
 logger = logging.getLogger(__name__)
@@ -66,8 +65,8 @@ class Recorder:
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._stopping = threading.Event()
         self._session: Session | None = None
-        self._kept = KeptRun(store, rig)
         self._black_box = BlackBox(black_box_folder(config))
+        self._kept = KeptRun(store, rig, self._black_box)
         self._auto_arm = config.recording.auto_arm
         self._try_again_at = 0.0
         self._last_error = ""
@@ -217,8 +216,7 @@ class Recorder:
         try:
             duration_s = duration_s or self._config.recording.duration_s
             check_monotonic_is_boottime(read_clock_triplet())
-            if self._black_box.holds_runs:  # the card was full when the daemon began
-                recover_runs(self._store, self._black_box.folder)
+            self._black_box.bring_in(self._store)  # where the card was full when the daemon began
             make_room(self._config, self._store, duration_s)
             check_room(self._config, self._store, duration_s)
             session = Session(
@@ -299,9 +297,7 @@ class Recorder:
         if session is None:
             return
         # Held from here on, whatever the sensors do when they are let go.
-        recording = session.collect(interrupted=interrupted)
-        self._kept.keep(recording)
-        self._black_box.take(lambda: recording)
+        self._kept.keep(session.collect(interrupted=interrupted))
         ended = time.monotonic()
         self._change("stop" if interrupted else "window-over")
         self._close_session()
@@ -327,7 +323,6 @@ class Recorder:
             self._change("save-failed", reason=reason)
             return False
         self._try_again_at = 0.0
-        self._black_box.forget()
         self._change("saved", run_id=saved.run_id)
         if saved.missing:
             logger.warning(
@@ -352,10 +347,8 @@ class Recorder:
         finally:
             self._close_session()
             self._light.put_out()
-        if self._kept.run_id == self._black_box.run_id != "":
-            logger.warning("%s: not on the card; a copy waits for the next start", self._kept.run_id)
-        elif self._kept.run_id:
-            logger.error("%s: lost from memory; its folder holds what was saved", self._kept.run_id)
+        if self._kept.run_id:
+            logger.error("%s: %s", self._kept.run_id, self._kept.fate)
         while not self._inbox.empty():
             command = self._inbox.get()
             if command is not None:

@@ -1,6 +1,5 @@
 """How a recording becomes a run folder: part by part, so that a bug in one costs no other."""
 
-import logging
 import platform
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -11,7 +10,7 @@ from typing import BinaryIO, TypeVar
 import msgspec
 import numpy as np
 
-from bricktrack_common.errors import RunFormatError, StorageError
+from bricktrack_common.errors import RunFormatError
 from bricktrack_common.frame_times import write_frames
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag, write_imu
 from bricktrack_common.run_folder import write_edges
@@ -27,10 +26,9 @@ from bricktrack_common.run_manifest import (
     parse_manifest,
 )
 from bricktrack_common.typed_data import dump_json
+from bricktrack_device.capture.part_by_part import unless_a_bug
 from bricktrack_device.capture.recording import Recording
 from bricktrack_device.storage.run_writer import RunWriter
-
-logger = logging.getLogger(__name__)
 
 _PACKAGES = (
     "bricktrack", "numpy", "pyzmq", "gpiozero", "adafruit-circuitpython-bno055", "lgpio", "picamera2", "av",
@@ -92,17 +90,14 @@ def streams(recording: Recording) -> Iterator[tuple[str, Callable[[BinaryIO], ob
 
 
 def _unless_a_bug(recording: Recording, what: str, make: Callable[[], T], otherwise: T) -> T:
-    """Return what ``make`` does, or ``otherwise`` where it fails by anything but the card."""
-    try:
-        return make()
-    except StorageError:
-        raise
-    except Exception as e:
-        words = f"{what}: internal error: {type(e).__name__}: {e}"
-        if words not in recording.missing:
-            logger.exception("%s: %s: a bug; the run is saved without", recording.run_id, what)
-            recording.missing.append(words)
-        return otherwise
+    return unless_a_bug(what, make, otherwise, note=partial(_note, recording))
+
+
+def _note(recording: Recording, words: str) -> bool:
+    is_new = words not in recording.missing
+    if is_new:
+        recording.missing.append(words)
+    return is_new
 
 
 def build_manifest(recording: Recording) -> RunManifest:

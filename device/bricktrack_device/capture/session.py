@@ -14,6 +14,7 @@ from bricktrack_common.errors import BricktrackError, HardwareError
 from bricktrack_common.run_manifest import ClocksSection, WaveSection
 from bricktrack_device.capture.camera_stream import CameraStream
 from bricktrack_device.capture.edge_report import judge_edges
+from bricktrack_device.capture.part_by_part import unless_a_bug
 from bricktrack_device.capture.recording import ImuRecording, Recording, RunLog
 from bricktrack_device.capture.ring import RING_SLACK_S
 from bricktrack_device.capture.run_light import RunLight
@@ -206,7 +207,7 @@ class Session:
             ("imus", self._watch_imus),
             ("camera", self._watch_camera),
         ):
-            self._unless_it_fails(f"watching the {name}", look, None)
+            self._unless_a_bug(f"watching the {name}", look, None)
 
     def _watch_imus(self) -> None:
         for reader in self.imus:
@@ -302,19 +303,19 @@ class Session:
         start_ns, end_ns = self.window_ns
         until_ns = min(end_ns, until_ns or end.monotonic_ns)
         unknown: tuple[WaveSection, list[str]] = WaveSection(), []
-        wave, found = self._unless_it_fails("the wave", lambda: self._judge_edges(edges, until_ns), unknown)
+        wave, found = self._unless_a_bug("the wave", lambda: self._judge_edges(edges, until_ns), unknown)
         imus = []
         for reader in self.imus:
-            taken = self._unless_it_fails(
+            taken = self._unless_a_bug(
                 f"imu {reader.name}", partial(_recording_of, reader, start_ns, until_ns), None
             )
             if taken is not None:
                 imus.append(taken)
                 found += taken.problems()
-        video = self._unless_it_fails("video", lambda: self.camera.cut(start_ns, until_ns), None)
+        video = self._unless_a_bug("video", lambda: self.camera.cut(start_ns, until_ns), None)
         if video is not None:
             found += video.problems
-        described: dict[str, str] = self._unless_it_fails("the hardware", self._rig.describe, {})
+        described: dict[str, str] = self._unless_a_bug("the hardware", self._rig.describe, {})
         hardware = described | {f"sampler of imu {i.name}": i.scheduling for i in self.imus if i.scheduling}
         if self._light.words:
             hardware["leds"] = self._light.words
@@ -338,14 +339,8 @@ class Session:
             log=self.log,
         )
 
-    def _unless_it_fails(self, what: str, make: Callable[[], T], otherwise: T) -> T:
-        """Return a part of the run, or ``otherwise`` where a bug is in the way: the other parts are kept."""
-        try:
-            return make()
-        except Exception as e:
-            if self.note_bug(f"{what}: internal error: {type(e).__name__}: {e}"):
-                logger.exception("%s: %s: a bug; the run goes on without", self.run_id, what)
-            return otherwise
+    def _unless_a_bug(self, what: str, make: Callable[[], T], otherwise: T) -> T:
+        return unless_a_bug(what, make, otherwise, note=self.note_bug)
 
     def _judge_edges(self, edges: EdgeTrain, until_ns: int) -> tuple[WaveSection, list[str]]:
         """Count what is wrong with the wave, and say it in words."""
