@@ -125,35 +125,19 @@ def assembly_motion(
         for view in assembly.view
         if view.unit in tracks
     }
-    n = len(sample)
-    at_rest = Motion(
-        np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros((n, 6, 6)), np.zeros(n, np.int64)
-    )
-    chains: dict[str, tuple[str, ...]] = {assembly.base: ()}
-    motions: dict[str, Motion] = {assembly.base: at_rest}
-    used: set[str] = set()
-    while True:
-        reached = dict(motions)  # one more view a round: chains stay the shortest
-        for view in assembly.view:
-            if view.unit not in seen:
-                continue
-            for start, end, step in _both_ways(view, seen[view.unit]):
-                if start in reached and end not in motions:
-                    motions[end] = reached[start] @ step
-                    chains[end] = (*chains[start], view.unit)
-                    used.add(view.unit)
-        if len(motions) == len(reached):
-            break
+    motions, chains = _from_base(assembly, seen, len(sample))
+    used = {unit for chain in chains.values() for unit in chain}
     names = [component.name for component in assembly.component]
     lost = [name for name in names if name not in motions]
     if lost:
         problems.append(
             f"{', '.join(lost)}: not seen from the base {assembly.base}, for want of the results above"
         )
-    loops = []
-    for view in assembly.view:
-        if view.unit in seen and view.unit not in used and view.camera_on in motions:
-            loops.append(_loop_check(view, seen[view.unit], motions))
+    loops = [
+        _loop_check(view, seen[view.unit], motions)
+        for view in assembly.view
+        if view.unit in seen and view.unit not in used and view.camera_on in motions
+    ]
     problems += [
         f"{loop.unit}: the loop that it closes gapes by {loop.rms_mm:.3f} mm and {loop.rms_deg:.3f} deg rms, "
         f"{loop.normalised:.1f} times the variance expected: a mount in the fleet file, a layout "
@@ -173,6 +157,28 @@ def assembly_motion(
         loops=tuple(loops),
         problems=tuple(problems),
     )
+
+
+def _from_base(
+    assembly: AssemblyConfig, seen: Mapping[str, Motion], n: int
+) -> tuple[dict[str, Motion], dict[str, tuple[str, ...]]]:
+    """Return how each component that views lead to moved against the base, and the units of its chain."""
+    at_rest = Motion(
+        np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros((n, 6, 6)), np.zeros(n, np.int64)
+    )
+    motions: dict[str, Motion] = {assembly.base: at_rest}
+    chains: dict[str, tuple[str, ...]] = {assembly.base: ()}
+    while True:
+        reached = dict(motions)  # one more view a round: chains stay the shortest
+        for view in assembly.view:
+            if view.unit not in seen:
+                continue
+            for start, end, step in _both_ways(view, seen[view.unit]):
+                if start in reached and end not in motions:
+                    motions[end] = reached[start] @ step
+                    chains[end] = (*chains[start], view.unit)
+        if len(motions) == len(reached):
+            return motions, chains
 
 
 def _usable(

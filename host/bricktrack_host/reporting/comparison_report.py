@@ -7,6 +7,7 @@ import numpy as np
 
 from bricktrack_host.datasets.comparison import AT_WORDS, Alike, Change, worst_first
 from bricktrack_host.datasets.comparison_pairs import Comparison
+from bricktrack_host.durable_files import storage_errors
 from bricktrack_host.reporting.chart import Chart, panel_grid
 from bricktrack_host.reporting.chart_marks import Spans, band
 from bricktrack_host.reporting.combined_charts import NAMES, spans
@@ -33,6 +34,8 @@ def write_comparison_page(
     StorageError
         If it cannot be written.
     """
+    with storage_errors(path, "Choose another --output, or make room"):
+        path.parent.mkdir(parents=True, exist_ok=True)
     write_page(path, render_comparison(comparison, progress=progress))
 
 

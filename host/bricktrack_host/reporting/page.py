@@ -50,7 +50,6 @@ def write_page(path: Path, html: str) -> None:
     """
     partial = partial_path(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         partial.write_text(html, encoding="utf-8")
         partial.replace(path)
     except OSError as e:

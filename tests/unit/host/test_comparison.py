@@ -244,3 +244,6 @@ def test_the_command_prints_a_table_and_writes_page_and_csv(lab, tmp_path):
     refused = invoke("compare", lab / "b7-1", "-o", page)
     assert refused.exit_code == 1
     assert "Name two to compare" in refused.output
+    in_the_way = invoke("compare", lab / "b7-2", "-o", table / "page.html")
+    assert in_the_way.exit_code == 1
+    assert "Choose another --output" in " ".join(in_the_way.output.split())
