@@ -42,7 +42,7 @@ def run_page(name: str, folder: Path) -> list[str]:
             env=environment,
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=900,  # loops may have to be compiled, on a machine with other work
         )
         assert done.returncode == 0, f"$ {command}\n{done.stdout}\n{done.stderr}"
         outputs.append(done.stdout + done.stderr)
