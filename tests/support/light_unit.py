@@ -3,7 +3,7 @@
 ``python light_unit.py STORAGE`` arms itself, is triggered by a wave of its own soon after, records for half a
 second, saves and arms itself again, until it is ended. Its video has the size that a real one has.
 With ``--idle`` it only serves what is on its card; with ``--port N`` on this port; with ``--keys FOLDER`` it
-wants to know who asks.
+wants to know who asks; with ``--black-box FOLDER`` it keeps a copy of the run under way there.
 """
 
 import argparse
@@ -44,12 +44,17 @@ WAVE_HZ = 100.0
 
 
 def light_config(
-    storage: Path, *, auto_arm: bool = True, port: int = 0, keys: Path | None = None
+    storage: Path,
+    *,
+    auto_arm: bool = True,
+    port: int = 0,
+    keys: Path | None = None,
+    black_box: Path | None = None,
 ) -> DeviceConfig:
     """Return what such a unit is told."""
     return DeviceConfig(
         unit=UnitTable(name="light"),
-        storage=StorageTable(folder=str(storage), margin_mb=1),
+        storage=StorageTable(folder=str(storage), margin_mb=1, black_box=str(black_box or "")),
         server=ServerTable(port=port, keys=str(keys or "")),
         trigger=TriggerTable(nominal_hz=WAVE_HZ),
         recording=RecordingTable(
@@ -140,7 +145,14 @@ if __name__ == "__main__":
     parser.add_argument("--idle", action="store_true")
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--keys", type=Path)
+    parser.add_argument("--black-box", type=Path)
     options = parser.parse_args()
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
-    config = light_config(options.storage, auto_arm=not options.idle, port=options.port, keys=options.keys)
+    config = light_config(
+        options.storage,
+        auto_arm=not options.idle,
+        port=options.port,
+        keys=options.keys,
+        black_box=options.black_box,
+    )
     Daemon(config, SelfDrivenRig()).run()
