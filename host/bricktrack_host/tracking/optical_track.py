@@ -117,10 +117,12 @@ def solve_poses(
     uv, R, t_mm = first.uv_px, first.R_camera_brick, first.t_camera_brick_mm
     known_motion = motion
     is_given = known_motion is not None or not rolling_shutter
+    of_instants: LedMotion | None = None
     torn, twist_doubt = np.zeros(n, dtype=np.bool_), np.zeros((n, 6))
     for _ in range(_PASSES):
         if not is_given:
-            motion = _no_less_sure(motion_to_leds(t_ns, led_t_ns, R, t_mm), motion)
+            motion = _no_less_sure(motion_to_leds(t_ns, led_t_ns, R, t_mm), of_instants)
+            of_instants = of_instants or motion
         n_before, n_torn = int(all_finite(uv).sum()), int(torn.sum())
         if motion is not None and motion.twist_sd is not None:
             motion = replace(motion, twist_sd=np.maximum(motion.twist_sd, twist_doubt))
@@ -171,15 +173,15 @@ def solve_poses(
     return replace(track, shared_covariance=of_leds + of_profile)
 
 
-def _no_less_sure(motion: LedMotion, before: LedMotion | None) -> LedMotion:
-    """Return a motion as sure as it was a pass before, where it was surer.
+def _no_less_sure(motion: LedMotion, of_instants: LedMotion | None) -> LedMotion:
+    """Return a motion at least as sure as poses of frames taken for instants make it.
 
-    Poses with few LEDs scatter by what the motion leaves them free to, and motions by what poses scatter:
-    each pass would be less sure than the one before.
+    Later poses with few LEDs scatter by what the motion leaves them free to, and the motion by what poses
+    scatter: each pass would be less sure than the one before.
     """
-    if before is None or before.twist_sd is None or motion.twist_sd is None:
+    if of_instants is None or of_instants.twist_sd is None or motion.twist_sd is None:
         return motion
-    return replace(motion, twist_sd=np.minimum(motion.twist_sd, before.twist_sd))
+    return replace(motion, twist_sd=np.minimum(motion.twist_sd, of_instants.twist_sd))
 
 
 def start_poses(
