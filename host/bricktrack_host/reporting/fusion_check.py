@@ -37,11 +37,9 @@ def fusion_check_chart(result: RunResult, figures: KeyFigures, two: TwoFusions) 
     t_ns = two.by_leds.t_ns[order]
     shift_mm = (two.by_leds.t_camera_brick_mm - two.by_poses.t_camera_brick_mm)[order]
     turn = np.swapaxes(two.by_poses.R_camera_brick, 1, 2) @ two.by_leds.R_camera_brick
-    known = np.isfinite(turn).all(axis=(1, 2))
-    turn_deg = np.full((len(turn), 3), np.nan)
-    turn_deg[known] = np.rad2deg(rvec_from_matrix(turn[known]))
-    allowed_by_both = two.by_leds.covariance + two.by_poses.covariance  # as `fusion.cross_check` has it
-    sd = np.sqrt(np.diagonal(allowed_by_both, axis1=1, axis2=2))[order]
+    turn_deg = np.rad2deg(rvec_from_matrix(turn))
+    variances = (np.diagonal(one.covariance, axis1=1, axis2=2) for one in (two.by_leds, two.by_poses))
+    sd = np.sqrt(sum(variances))[order]  # allowed by both, as `fusion.cross_check` has it
     axis = TimeAxis.of(result)
     chart = panel_grid(2, height_in=3.6, legend=True)
     for (panel,), values, allowed, words in zip(

@@ -50,24 +50,31 @@ class RayErrors:
         R_camera_brick : ndarray, shape (n, 3, 3)
         t_camera_brick_mm : ndarray, shape (n, 3), mm
         """
-        way = self._way_to(R_camera_brick, t_camera_brick_mm)
-        return _sum_of_factors(
-            np.concatenate([np.ones((len(way), 1)), way], axis=1),
-            np.concatenate([self.factor[None], self.slopes]),
-        )
+        factors = np.concatenate([self.factor[None], self.slopes])
+        return self._sum(_products(factors), R_camera_brick, t_camera_brick_mm)
 
-    def covariance_from_there(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> FloatArray:
-        """Return the covariance, shape (n, 6, 6), of ``[dtheta rad, dt mm]`` of n poses seen from `about`.
+    def change_from_there(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> FloatArray:
+        """Return by how much, shape (n, 6, 6), `covariance` changes where n poses are seen from `about`.
 
-        Both ends err alike but for the slopes, and for what an attitude that is off does to the way between:
-        ``D = X_about^-1 X`` to first order of the way, see `RestPose.relative_covariance`.
+        Of ``[dtheta rad, dt mm]`` in the axes of `about`. Both ends err alike but for the slopes, and for what
+        an attitude that is off does to the way between: ``D = X_about^-1 X`` to first order of the way, see
+        `RestPose.relative_covariance`.
         """
         R = self.about.R.T
-        slopes = self.slopes.copy()
-        slopes[:, 3:] = R @ slopes[:, 3:]
-        slopes[:3, :3] += skew(np.eye(3)) @ self.factor[:3]
-        slopes[3:, 3:] += skew(R.T) @ self.factor[:3]
-        return _sum_of_factors(self._way_to(R_camera_brick, t_camera_brick_mm), slopes)
+        alone = np.concatenate([self.factor[None], self.slopes])
+        alone[:, 3:] = R @ alone[:, 3:]
+        seen = alone.copy()
+        seen[0] = 0.0
+        seen[1:4, :3] += skew(np.eye(3)) @ self.factor[:3]
+        seen[4:, 3:] += skew(R.T) @ self.factor[:3]
+        return self._sum(_products(seen) - _products(alone), R_camera_brick, t_camera_brick_mm)
+
+    def _sum(self, products: FloatArray, R: FloatArray, t_mm: FloatArray) -> FloatArray:
+        """Return the sums, shape (n, 6, 6), of `_products` of factors by 1 and by the way to n poses."""
+        way = self._way_to(R, t_mm)
+        weights = np.concatenate([np.ones((len(way), 1)), way], axis=1)
+        i, j = np.triu_indices(7)
+        return np.asarray(((weights[:, i] * weights[:, j]) @ products.reshape(-1, 36)).reshape(-1, 6, 6))
 
     def _way_to(self, R: FloatArray, t_mm: FloatArray) -> FloatArray:
         """Return the coordinates of the way from `about` to poses, shape (n, 6), to first order."""
@@ -76,16 +83,15 @@ class RayErrors:
         return np.concatenate([np.stack(turn, axis=1) / 2, t_mm - self.about.t_mm], axis=1)
 
 
-def _sum_of_factors(weights: FloatArray, factors: FloatArray) -> FloatArray:
-    """Return ``A A^T``, shape (n, 6, 6), of ``A = sum weights[:, i] factors[i]``, factors of shape (c, 6, m).
+def _products(factors: FloatArray) -> FloatArray:
+    """Return the products, shape (28, 6, 6), that make up ``A A^T`` of ``A = sum w[i] factors[i]``.
 
-    Weights of pairs of factors are all that differs from row to row.
+    One for each pair of the factors, shape (7, 6, m), to be weighed by ``w[i] w[j]``: weights of pairs are
+    all that differs from pose to pose.
     """
     i, j = np.triu_indices(len(factors))
     products = np.einsum("pam,pbm->pab", factors[i], factors[j])
-    products = np.where((i == j)[:, None, None], products, products + np.swapaxes(products, 1, 2))
-    pairs = weights[:, i] * weights[:, j]
-    return np.asarray((pairs @ products.reshape(len(i), 36)).reshape(-1, 6, 6))
+    return np.asarray(np.where((i == j)[:, None, None], products, products + np.swapaxes(products, 1, 2)))
 
 
 def ray_errors(
