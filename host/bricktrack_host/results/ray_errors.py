@@ -56,9 +56,9 @@ class RayErrors:
     def change_from_there(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> FloatArray:
         """Return by how much, shape (n, 6, 6), `covariance` changes where n poses are seen from `about`.
 
-        Of ``[dtheta rad, dt mm]`` in the axes of `about`. Both ends err alike but for the slopes, and for what
-        an attitude that is off does to the way between: ``D = X_about^-1 X`` to first order of the way, see
-        `RestPose.relative_covariance`.
+        Of ``[dtheta rad, dt mm]`` in the axes of `about`. Both ends err alike but for the slopes, and for
+        what an attitude that is off does to the way between: ``D = X_about^-1 X`` to first order of the way,
+        see `RestPose.relative_covariance`.
         """
         R = self.about.R.T
         alone = np.concatenate([self.factor[None], self.slopes])
