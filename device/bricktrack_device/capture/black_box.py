@@ -39,6 +39,23 @@ def black_box_folder(config: DeviceConfig) -> Path | None:
     return Path(runtime) / "black-box" if runtime else None
 
 
+def lack_of_room(folder: Path, video_bytes: int) -> str:
+    """Return in words why there will be no copy of a run with so much video, or ``""``.
+
+    Raises
+    ------
+    OSError
+        If the folder does not tell.
+    """
+    free, wanted = min(shutil.disk_usage(folder).free, memory_available_bytes() or 0), _ROOM * video_bytes
+    if free >= wanted:
+        return ""
+    return (
+        f"{free / 1e6:.0f} MB of memory are free for {folder}, {wanted / 1e6:.0f} MB are wanted. A daemon "
+        "that is killed while it records would lose the run"
+    )
+
+
 class BlackBox:
     """Copies of runs, each in a folder named by it; nothing here raises, because the run itself goes on.
 
@@ -71,17 +88,14 @@ class BlackBox:
             return
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            free = min(shutil.disk_usage(self.folder).free, memory_available_bytes() or 0)
-            if free < _ROOM * video_bytes:
-                logger.warning(
-                    "%s: no copy in memory: %.0f MB are free for %s, %.0f MB are wanted. A daemon that is "
-                    "killed would lose this run", run_id, free / 1e6, self.folder, _ROOM * video_bytes / 1e6,
-                )  # fmt: skip
-                return
+            problem = lack_of_room(self.folder, video_bytes)
             run = self.folder / run_id
-            run.mkdir()
+            if not problem:
+                run.mkdir()
         except OSError as e:
-            logger.warning("%s: no copy in memory: %s: %s", run_id, self.folder, e.strerror or e)
+            problem = f"{self.folder}: {e.strerror or e}"
+        if problem:
+            logger.warning("%s: no copy in memory: %s", run_id, problem)
             return
         self._run = run
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import StorageError
+from bricktrack_device.capture.black_box import black_box_folder, lack_of_room
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health.findings import CheckResult, failure, good, warning
 from bricktrack_device.storage.run_store import RunStore
@@ -30,6 +31,18 @@ def check_space(config: DeviceConfig, *, folder: Path | None = None) -> list[Che
     if free < 5 * needed:
         return [warning("storage", f"{words}. That is room for few", "Pull runs and make room")]
     return [good("storage", words)]
+
+
+def check_black_box(config: DeviceConfig) -> list[CheckResult]:
+    """See that a copy of a run fits into memory, if one is to be kept; raise `OSError` where that fails."""
+    folder = black_box_folder(config)
+    if folder is None:
+        return []
+    there = next(p for p in (folder, *folder.parents) if p.is_dir())  # it is made with the first run
+    problem = lack_of_room(there, config.video_bytes())
+    if problem:
+        return [warning("black box", problem, "Free memory, or lower camera.bitrate_bps or the duration")]
+    return [good("black box", f"a run is also kept in {folder} until it is on the card")]
 
 
 def write_speed_bps(

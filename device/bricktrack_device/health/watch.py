@@ -95,6 +95,7 @@ class HealthWatch:
             self._lasting = self._look_once()
         results = tried("clocks", "Reboot the unit and disable suspend", machine.check_clocks)
         results += tried("storage", "Set storage.folder", lambda: storage.check_space(self._config))
+        results += tried("black box", "Set storage.black_box", lambda: storage.check_black_box(self._config))
         results += machine.check_temperature()
         results += machine.check_throttling(machine.read_throttled())
         return results + self._lasting

@@ -6,6 +6,7 @@ import pytest
 from device_fakes import FakeRig
 
 from bricktrack_device.backends import open_rig
+from bricktrack_device.capture import black_box
 from bricktrack_device.config import DeviceConfig, RecordingTable, SamplerTable, StorageTable
 from bricktrack_device.hardware.yuv import split_i420
 from bricktrack_device.health import machine, storage
@@ -171,6 +172,19 @@ class TestStorage:
             storage=StorageTable(folder=str(tmp_path), margin_mb=10**8), recording=RecordingTable()
         )
         assert storage.check_space(config)[0].level == "fail"
+
+    def test_no_room_in_memory_for_a_copy_of_a_run_is_a_warning(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+        assert storage.check_black_box(CONFIG) == []  # none is kept
+        table = StorageTable(black_box=str(tmp_path / "not" / "yet"))
+        config = DeviceConfig(storage=table)
+        (found,) = storage.check_black_box(config)
+        assert found.level == "ok" and str(tmp_path) in found.detail
+        monkeypatch.setattr(black_box, "memory_available_bytes", lambda: 30_000_000)
+        (found,) = storage.check_black_box(config)  # 16 s at 12 Mbit/s are 24 MB
+        assert found.level == "warn" and "30 MB" in found.detail and "48 MB" in found.detail
 
 
 class TestTriggerLine:
