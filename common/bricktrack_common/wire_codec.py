@@ -87,8 +87,10 @@ def _unpack(data: bytes) -> tuple[object, int]:
     if not isinstance(value, dict) or not isinstance(value.get("protocol"), int):
         raise ProtocolError("not a message of this protocol: no version number")
     if value["protocol"] != PROTOCOL_VERSION:
+        older = "the other end" if value["protocol"] < PROTOCOL_VERSION else "this one"
         raise VersionError(
-            f"protocol version {value['protocol']}; this bricktrack speaks version {PROTOCOL_VERSION}"
+            f"protocol version {value['protocol']}; this bricktrack speaks version {PROTOCOL_VERSION}. "
+            f"Upgrade {older}"
         )
     minor = value.get("minor")
     return value, minor if isinstance(minor, int) else 0

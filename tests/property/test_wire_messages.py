@@ -100,8 +100,12 @@ def test_an_unknown_key_or_a_wrong_type_is_refused(body, key, value):
 
 
 def test_another_version_is_told_apart_from_nonsense():
-    with pytest.raises(VersionError, match="protocol version 9; this bricktrack speaks version 2"):
+    with pytest.raises(VersionError, match=r"protocol version 9; .* speaks version 2\. Upgrade this one"):
         decode_request(msgpack.packb({"protocol": 9}))
+    with pytest.raises(
+        VersionError, match=r"protocol version 1; .* speaks version 2\. Upgrade the other end"
+    ):
+        decode_reply(msgpack.packb({"protocol": 1}))
 
 
 def test_a_path_is_never_taken_for_a_run():

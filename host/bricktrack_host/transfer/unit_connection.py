@@ -155,7 +155,7 @@ class UnitConnection:
             try:
                 request_id, reply = decode_reply(header)
             except VersionError as e:
-                raise ProtocolError(f"{self.address}: {e}. Install the same bricktrack on both ends") from e
+                raise ProtocolError(f"{self.address}: {e}") from e
             except ProtocolError as e:
                 logger.debug("%s: foreign message: %s", self.address, e)
                 self.counts.foreign_messages += 1
