@@ -178,8 +178,11 @@ class RotationFit:
                 inside[segment == k] = False
         return inside, segment
 
-    def solve(self, offset_s: float) -> Fit | None:
-        """Return the fit that starts at an offset, or None where too few frames have gyro beside them."""
+    def solve(self, offset_s: float, *, reach_s: float = np.inf) -> Fit | None:
+        """Return the fit that starts at an offset, or None where too few frames have gyro beside them.
+
+        None as well where it goes farther than ``reach_s`` from there.
+        """
         inside, segment = self._frames_beside_gyro(offset_s)
         if inside.sum() < MIN_POSES:
             return None
@@ -212,6 +215,8 @@ class RotationFit:
             sd = max(float(np.median(residual)) / 0.888 / np.sqrt(freedom), 1e-6)
             weight = (1 + (residual / (2.5 * sd)) ** 2) ** -0.25  # soft-L1 by reweighting
             offset, skew = offset + float(np.clip(step[0], -0.02, 0.02)), skew + float(step[1])
+            if abs(offset - offset_s) > reach_s:
+                return None
             if iteration == 2:
                 # A bias left in turns the axes in which the errors are compared.
                 bias, _ = self._bias(t, segment[inside], attitude, drift, sd * self._sd[inside])

@@ -32,6 +32,7 @@ _CLEAR_SPEED_CORRELATION = 0.8
 _UNKNOWN_BIAS_RADPS = 0.02  # BNO055 data sheet: zero-rate offset at most 3 deg/s, typically 1
 _FILTER_ROUNDS = 2
 _FILTER_SIGMA = 2.5
+_OWN_REACH_S = 0.03  # from a correlation's maximum: half a period of 16 Hz
 MIN_ROTATION_SD_RAD = 1e-5  # a covariance below this is not believed
 
 
@@ -201,7 +202,11 @@ def align_times(
     prior_s = prior_offset_ns * 1e-9
     correlation = correlate(t_s, R, signal, centre_s=prior_s, max_offset_s=max_offset_s)
     solver = RotationFit(t_s, R, sd_rad, signal, skew_prior_sd=skew_prior_sd)
-    fits = [fit for lag in correlation.candidates_s() if (fit := solver.solve(lag)) is not None]
+    fits: list[Fit] = []
+    for lag in correlation.candidates_s():
+        # The first may go where it likes; another that leaves its own maximum comes to one found before.
+        if (fit := solver.solve(lag, reach_s=_OWN_REACH_S if fits else np.inf)) is not None:
+            fits.append(fit)
     fits = [fit for fit in fits if abs(fit.offset_s - prior_s) <= max_offset_s + GRID_S]
     if not fits:
         return from_stamps("no offset within reach lets the angular rates agree")
