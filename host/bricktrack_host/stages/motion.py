@@ -8,6 +8,7 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import ShapeError, TrackingError
+from bricktrack_host.fusion.camera_step import words_on_camera_step
 from bricktrack_host.fusion.estimate import FusionResult, fuse
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import BRIDGE_PERIODS, seconds_since
@@ -96,6 +97,13 @@ def retime(
         if not np.isfinite(optical.t_camera_brick_mm).any():
             break
     return optical
+
+
+def words_on_knocks(optical: OpticalTrack, inertial: Inertial | None) -> list[str]:
+    """Return what to say of a camera that is to stand still and was knocked."""
+    if inertial is None or inertial.is_hint or inertial.camera is not None or inertial.slips is not None:
+        return []
+    return words_on_camera_step(optical, inertial.imu, inertial.alignment)
 
 
 def _frames_unfelt(optical: OpticalTrack, inertial: Inertial) -> BoolArray:

@@ -34,6 +34,7 @@ from bricktrack_host.stages.motion import (
     with_ray_errors,
     with_restamped_told,
     with_unsure_times,
+    words_on_knocks,
 )
 from bricktrack_host.stages.progress import Stages
 from bricktrack_host.stages.settings import ProcessSettings
@@ -117,6 +118,7 @@ def solve_run(
         if settings.rolling_shutter:
             optical = retime(observations, first, optical, inertial, rays, brick)
             _require_poses(optical, run, brick)
+        problems += words_on_knocks(optical, inertial)
         grid = output_grid(optical, inertial, edge_fit)
         seen = (observations, rays) if settings.rolling_shutter else None
         fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)

@@ -1,4 +1,4 @@
-"""The offset half-way through a run: a step is seen, a gyro whose scale is off is not taken for one."""
+"""The offset within a run: a step and a wander are seen, a gyro whose scale is off is not taken for one."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 from brick_shakes import simulate_shake
 from scipy.spatial.transform import Rotation
 
-from bricktrack_host.fusion.clocks.offset_change import change_of_halves
+from bricktrack_host.fusion.clocks.offset_change import change_of_halves, offset_wander
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 
 SCALE = np.array([1.01, 0.99, 1.0])
@@ -21,13 +21,19 @@ def turning(t_s):
     return Rotation.from_euler("xyz", angles, degrees=True)
 
 
-def recording(*, scale=1.0, step_ns=0):
+def late_s(t_s, rms_s):
+    """How late frames are: to and fro in 0.7 s, as an exposure that is controlled by the light."""
+    return np.sqrt(2) * rms_s * np.sin(2 * np.pi * t_s / 0.7)
+
+
+def recording(*, scale=1.0, step_ns=0, wander_s=0.0):
     """Return poses at 50 a second and samples of the gyro at 100; a simulated shake lends all else."""
     shake = simulate_shake(1, duration_s=1.2, frame_rate_hz=50.0)
     optical, imu = shake.optical, shake.imu
     t0_ns = int(optical.t_ns[0])
     noise = Rotation.from_rotvec(np.random.default_rng(5).normal(0, 5e-4, (len(optical.t_ns), 3)))
-    R = (turning((optical.t_ns - t0_ns) * 1e-9) * noise).as_matrix()
+    seen_s = (optical.t_ns - t0_ns) * 1e-9
+    R = (turning(seen_s + late_s(seen_s, wander_s)) * noise).as_matrix()
     at_s, half_s = (imu.t_ns - t0_ns) * 1e-9, 5e-4
     rate = (turning(at_s - half_s).inv() * turning(at_s + half_s)).as_rotvec() / (2 * half_s)
     covariance = np.broadcast_to(np.diag([2.5e-7] * 3 + [1e-4] * 3), optical.covariance.shape)
@@ -60,3 +66,20 @@ def test_a_step_of_the_stamps_is_found_whatever_the_scale(scale):
 def test_without_an_offset_by_the_motion_nothing_is_told():
     optical, imu = recording()
     assert change_of_halves(optical, imu, replace(align_times(optical, imu), source="stamps")) is None
+
+
+@pytest.mark.parametrize("scale", [1.0, SCALE])
+def test_an_offset_that_stays_does_not_wander(scale):
+    optical, imu = recording(scale=scale)
+    assert offset_wander(optical, imu, align_times(optical, imu)) is None
+
+
+def test_frames_that_are_late_by_turns_are_told_with_how_much():
+    optical, imu = recording(wander_s=2e-3)
+    wander = offset_wander(optical, imu, align_times(optical, imu))
+    # Beside a steady rate: over two waves the clocks seem to run apart, which is put back.
+    assert wander.rms_s == pytest.approx(2e-3, rel=0.45)
+    assert wander.sd_s.shape == optical.t_ns.shape
+    late = late_s((optical.t_ns - optical.t_ns[0]) * 1e-9, 2e-3)
+    moving = slice(15, 48)  # from 0.3 to 0.95 s
+    assert np.sqrt(np.mean((late[moving] / wander.sd_s[moving]) ** 2)) < 2

@@ -16,6 +16,7 @@ from bricktrack_host.fusion.clocks.offset_change import (
     OffsetChange,
     change_of_halves,
     offset_change,
+    offset_wander,
 )
 from bricktrack_host.fusion.clocks.stamp_regularity import (
     JITTER_NS,
@@ -109,6 +110,14 @@ def check_stamps(
                 f"the clocks of IMU and camera run apart by {alignment.skew * 1e6:.0f} ppm, by the rotations "
                 "that both saw, where crystals hold 100: one of the two is scaled. Poses are as unsure as "
                 f"the motion in the {spread_ns / 1e6:.1f} ms that come together to either end of the run"
+            )
+        elif (wander := offset_wander(optical, imu, alignment)) is not None:
+            is_contradicted, sd_ns = True, np.hypot(sd_ns, wander.sd_s * 1e9)
+            problems.append(
+                f"the offset of IMU and camera wanders by {wander.rms_s * 1e3:.1f} ms (rms) within the run, "
+                "by the rotations that both saw: the exposure changes and is not the one that is stated, or "
+                "frames are stamped late. Fix the exposure, or give each frame's (`bricktrack import "
+                "--exposures`). Poses are as unsure as the motion in that time"
             )
     if alignment is not None and alignment.disagrees_with_stamps:
         is_contradicted, spread_ns = True, float(np.hypot(spread_ns, alignment.offset_ns))

@@ -27,6 +27,8 @@ _GYRO_AXES_SD = 0.02  # of scales, and of axes in rad: consumer sensors, and a l
 _SETTLED_S = 1e-6  # a twentieth of the sharpest sd
 _ROBUST_ROUNDS = 4
 _MISFIT_CAP = 25.0
+_BESIDE_STEP = 4  # frames on either side that a step needs
+_STEP_TIME_SD_S = 0.02
 LOSS_PRIOR_SD_S2 = 2e-5  # of c: 4.5 ms squared, the BNO055's narrower settings
 DISPERSION_PRIOR_SD_S3 = 5e-8
 """Of d: a second-order low-pass of 7 ms mean delay has 3e-8 (critically damped) to -6e-8 (Butterworth)."""
@@ -119,6 +121,70 @@ def correlate(
         np.linalg.norm(optical, axis=-1, keepdims=True), np.linalg.norm(inertial, axis=-1, keepdims=True)
     )
     return Correlation(lags, speed, normalised(optical, inertial))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeStep:
+    """A step of optical attitudes against the gyro, from one frame on.
+
+    Attributes
+    ----------
+    frame : int
+        The first after it, from 0.
+    rvec_rad : ndarray, shape (3,)
+        In the axes that attitudes are compared in.
+    covariance : ndarray, shape (3, 3), rad^2
+    gain : float
+        By so much chi-square (3 degrees of freedom) is less with it.
+    """
+
+    frame: int
+    rvec_rad: FloatArray
+    covariance: FloatArray
+    gain: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """A robust fit: what was found, its covariance, frames' weights, scale, and columns less their drift."""
+
+    found: FloatArray
+    covariance: FloatArray
+    weight: FloatArray
+    scale: float
+    white: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LinearFit:
+    """Errors of attitudes, (n, 3), as a sum of columns, (n, 3, c), of prior sd (c,), beside a slow drift."""
+
+    inside: BoolArray
+    columns: FloatArray
+    sd: FloatArray
+    error: FloatArray
+    inverse_sd: FloatArray
+    hats: tuple[IntArray, FloatArray, int]
+
+    def drift(self, weight: FloatArray, values: FloatArray) -> FloatArray:
+        """Return the slow drift in values, (n, c)."""
+        return np.asarray(drift_of(weight, *self.hats, np.ascontiguousarray(values)))
+
+    def fit(self) -> _Fitted:
+        """Return the fit by weights that outliers lose."""
+        columns = np.concatenate([self.columns, self.error[:, :, None]], axis=2)
+        flat = columns.reshape(len(columns), -1)
+        scale, weight = 1.0, self.inverse_sd
+        for _ in range(_ROBUST_ROUNDS):
+            white = (flat - self.drift(weight, flat)).reshape(columns.shape)
+            A = (white * weight[:, None, None]).reshape(-1, columns.shape[2])
+            information = A[:, :-1].T @ A[:, :-1] / scale**2 + np.diag(self.sd**-2.0)
+            found = np.linalg.solve(information, A[:, :-1].T @ A[:, -1] / scale**2)
+            left = np.linalg.norm(white[:, :, -1] - white[:, :, :-1] @ found, axis=1) / np.sqrt(3)
+            # The median of sqrt(chi-square of 3 / 3) is 0.888.
+            scale = max(float(np.median(left * self.inverse_sd)) / 0.888, 1e-6)
+            weight = self.inverse_sd * (1 + (left * self.inverse_sd / (2.5 * scale)) ** 2) ** -0.25
+        return _Fitted(np.asarray(found), np.asarray(np.linalg.inv(information)), weight, scale, white)
 
 
 class RotationFit:
@@ -244,11 +310,43 @@ class RotationFit:
         prior_sd_s : ndarray, shape (c,), s
         gyro_bias_radps : ndarray, shape (3,)
         """
+        linear = self._linear(basis, prior_sd_s, gyro_bias_radps)
+        if linear is None:
+            return None
+        n, fit = basis.shape[1], linear.fit()
+        return fit.found[:n], fit.covariance[:n, :n]
+
+    def attitude_step(self, gyro_bias_radps: FloatArray) -> AttitudeStep | None:
+        """Return the step of the attitudes against the gyro that explains most; None as in `time_errors`.
+
+        One offset of the clocks, and scales and axes of the gyro, are free beside it.
+        """
+        n_frames = len(self._t)
+        linear = self._linear(np.ones((n_frames, 1)), np.array([_STEP_TIME_SD_S]), gyro_bias_radps)
+        if linear is None:
+            return None
+        fit, n = linear.fit(), len(linear.error)
+        since = np.tri(n)[:, _BESIDE_STEP : n - _BESIDE_STEP + 1]  # column k: one from a frame on
+        white = (since - linear.drift(fit.weight, since)) * (fit.weight / fit.scale)[:, None]
+        A = fit.white[:, :, :-1] * (fit.weight / fit.scale)[:, None, None]
+        left = fit.white[:, :, -1] * (fit.weight / fit.scale)[:, None] - A @ fit.found
+        beside = np.einsum("nk,nip->kip", white, A, optimize=True)
+        normal = np.einsum("nk,nk->k", white, white)[:, None, None] * np.eye(3)
+        normal -= beside @ fit.covariance @ np.swapaxes(beside, 1, 2)
+        pull = white.T @ left
+        size = np.linalg.solve(normal + 1e-9 * np.eye(3), pull[..., None])[..., 0]
+        gain = np.einsum("ki,ki->k", pull, size)
+        best = int(np.argmax(gain))
+        frame = int(np.flatnonzero(linear.inside)[best + _BESIDE_STEP])
+        return AttitudeStep(frame, size[best], np.linalg.inv(normal[best]), float(gain[best]))
+
+    def _linear(
+        self, basis: FloatArray, prior_sd_s: FloatArray, gyro_bias_radps: FloatArray
+    ) -> _LinearFit | None:
         inside, segment = self._frames_beside_gyro(0.0)
         if inside.sum() < MIN_POSES:
             return None
-        t, inverse_sd, n_basis = self._t[inside], 1 / self._sd[inside], basis.shape[1]
-        knot, share, n_knots = self._hats(t, segment[inside])
+        t = self._t[inside]
         self._remove_bias(gyro_bias_radps)
         attitude, error, design = compare_with_gyro(
             self._pieces, self._nodes, self._attitude, gyro_bias_radps, t, np.zeros_like(t), self._R[inside]
@@ -257,22 +355,16 @@ class RotationFit:
         by_axes = 0.5 * (attitude[1:] + attitude[:-1])[:, :, :, None] * turned[:, None, None, :]
         by_axes = np.concatenate([np.zeros((1, 3, 9)), np.cumsum(by_axes.reshape(-1, 3, 9), axis=0)])
         by_time = basis[inside][:, None, :] * design[:, :, :1]
-        columns = np.concatenate([by_time, design[:, :, 2:], by_axes, error[:, :, None]], axis=2)
-        sd = np.concatenate(
-            [prior_sd_s, [LOSS_PRIOR_SD_S2, DISPERSION_PRIOR_SD_S3], np.full(9, _GYRO_AXES_SD)]
+        return _LinearFit(
+            inside=inside,
+            columns=np.concatenate([by_time, design[:, :, 2:], by_axes], axis=2),
+            sd=np.concatenate(
+                [prior_sd_s, [LOSS_PRIOR_SD_S2, DISPERSION_PRIOR_SD_S3], np.full(9, _GYRO_AXES_SD)]
+            ),
+            error=error,
+            inverse_sd=1 / self._sd[inside],
+            hats=self._hats(t, segment[inside]),
         )
-        scale, weight = 1.0, inverse_sd
-        for _ in range(_ROBUST_ROUNDS):
-            flat = columns.reshape(len(t), -1)
-            white = (flat - drift_of(weight, knot, share, n_knots, flat)).reshape(columns.shape)
-            A = (white * weight[:, None, None]).reshape(-1, columns.shape[2])
-            information = A[:, :-1].T @ A[:, :-1] / scale**2 + np.diag(sd**-2.0)
-            found = np.linalg.solve(information, A[:, :-1].T @ A[:, -1] / scale**2)
-            left = np.linalg.norm(white[:, :, -1] - white[:, :, :-1] @ found, axis=1) / np.sqrt(3)
-            # The median of sqrt(chi-square of 3 / 3) is 0.888.
-            scale = max(float(np.median(left * inverse_sd)) / 0.888, 1e-6)
-            weight = inverse_sd * (1 + (left * inverse_sd / (2.5 * scale)) ** 2) ** -0.25
-        return found[:n_basis], np.linalg.inv(information)[:n_basis, :n_basis]
 
     @staticmethod
     def _bias(

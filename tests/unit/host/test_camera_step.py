@@ -1,0 +1,57 @@
+"""A camera that is knocked: its attitudes step against the gyro's; simulated shakes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from brick_shakes import simulate_shake
+
+from bricktrack_common.rotations import matrix_from_rvec
+from bricktrack_host.fusion.camera_step import words_on_camera_step
+from bricktrack_host.fusion.clocks.time_alignment import align_times
+
+AT = 60
+
+
+@pytest.fixture(scope="module")
+def shake():
+    return simulate_shake(3, duration_s=4.0)
+
+
+def told(optical, imu):
+    return words_on_camera_step(optical, imu, align_times(optical, imu))
+
+
+def knocked(optical, turn_deg):
+    R = optical.R_camera_brick.copy()
+    R[AT:] = matrix_from_rvec(np.deg2rad(turn_deg)) @ R[AT:]
+    return replace(optical, R_camera_brick=R)
+
+
+def test_a_camera_that_stands_still_is_not_spoken_of(shake):
+    assert told(shake.optical, shake.imu) == []
+
+
+def test_a_knock_is_told_with_its_frame_and_size(shake):
+    (words,) = told(knocked(shake.optical, [1.2, -1.5, 0.6]), shake.imu)
+    assert f"at frame {AT} " in words
+    size_deg = float(words.split("attitudes are ")[1].split(" ")[0])
+    assert size_deg == pytest.approx(np.linalg.norm([1.2, -1.5, 0.6]), rel=0.25)  # of attitudes that scatter
+
+
+def test_frames_without_a_pose_are_counted_too(shake):
+    optical = knocked(shake.optical, [1.2, -1.5, 0.6])
+    R, t_mm = optical.R_camera_brick.copy(), optical.t_camera_brick_mm.copy()
+    R[10:14], t_mm[10:14] = np.nan, np.nan
+    (words,) = told(replace(optical, R_camera_brick=R, t_camera_brick_mm=t_mm), shake.imu)
+    assert f"at frame {AT} " in words
+
+
+def test_a_gyro_whose_scale_is_off_is_no_knock(shake):
+    assert told(shake.optical, replace(shake.imu, gyro_radps=1.01 * shake.imu.gyro_radps)) == []
+
+
+def test_clocks_that_the_motion_does_not_tell_tell_no_knock(shake):
+    optical = knocked(shake.optical, [1.2, -1.5, 0.6])
+    alignment = replace(align_times(optical, shake.imu), source="stamps")
+    assert words_on_camera_step(optical, shake.imu, alignment) == []
