@@ -2,7 +2,7 @@
 
 import platform
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -183,10 +183,15 @@ def quality(recording: Recording) -> QualitySection:
 
 def software_versions() -> dict[str, str]:
     """Return what runs here, by name."""
+    return dict(_software_versions())
+
+
+@cache
+def _software_versions() -> tuple[tuple[str, str], ...]:
     versions = {"python": platform.python_version(), "kernel": platform.release()}
     for package in _PACKAGES:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    return versions
+    return tuple(versions.items())

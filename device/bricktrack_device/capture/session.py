@@ -81,6 +81,7 @@ class Session:
         self._imu_span_s = span_s
         self.imus: list[ImuReader] = []
         self.trigger: Trigger | None = None
+        self._described: dict[str, str] = {}
         self._line_told = False
         self._n_bugs = 0
         self._t_armed_ns = 0
@@ -315,8 +316,11 @@ class Session:
         video = self._unless_a_bug("video", lambda: self.camera.cut(start_ns, until_ns), None)
         if video is not None:
             found += video.problems
-        described: dict[str, str] = self._unless_a_bug("the hardware", self._rig.describe, {})
-        hardware = described | {f"sampler of imu {i.name}": i.scheduling for i in self.imus if i.scheduling}
+        # Asked once a run: on a small Pi this takes longer than all else here.
+        self._described = self._described or self._unless_a_bug("the hardware", self._rig.describe, {})
+        hardware = self._described | {
+            f"sampler of imu {i.name}": i.scheduling for i in self.imus if i.scheduling
+        }
         if self._light.words:
             hardware["leds"] = self._light.words
         return Recording(
