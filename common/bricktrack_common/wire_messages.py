@@ -20,9 +20,11 @@ MAX_CHUNK_BYTES = 1024 * 1024
 """The longest raw frame; longer data, a still's, are cut into several."""
 MAX_STILL_BYTES = 16 * 1024 * 1024
 DEFAULT_PORT = 41733
+LABEL_PATTERN = r"^[A-Za-z0-9_-]{0,32}$"
+"""What the end of a run's id may be."""
 
 _RunId = Annotated[str, msgspec.Meta(pattern=RUN_ID_PATTERN)]
-_Label = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,32}$")]
+_Label = Annotated[str, msgspec.Meta(pattern=LABEL_PATTERN)]
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 _Words = Annotated[str, msgspec.Meta(max_length=2000)]
 _Sha256 = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}$")]

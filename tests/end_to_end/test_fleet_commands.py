@@ -185,6 +185,15 @@ def test_arm_takes_a_pattern_and_names_who_did_not_acknowledge(many):
     assert told["ok"] is False
 
 
+def test_a_label_that_no_unit_takes_is_refused_before_any_is_asked(many):
+    units, fleet = many
+    for label in ("shake 7", "shake-0.3g", "x" * 33):
+        result = invoke("arm", "--fleet", fleet, "--label", label)
+        assert result.exit_code == 1
+        assert "expected letters, digits" in " ".join(result.stderr.split())
+    assert {unit.state for unit in units.values()} == {"idle"}
+
+
 def test_disarm_all_is_acknowledged_by_each(many):
     units, fleet = many
     for unit in units.values():

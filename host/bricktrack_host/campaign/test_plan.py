@@ -18,7 +18,8 @@ from bricktrack_host.durable_files import replace_durably, storage_errors
 
 PLAN_NAME = "plan.json"
 COMBINED_FOLDER = "combined"
-NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9.-]{0,31}$"
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9-]{0,31}$"
+"""Of a label that units take."""
 
 _Id = Annotated[str, msgspec.Meta(pattern=RUN_ID_PATTERN)]
 
@@ -53,8 +54,8 @@ def folder_of_test(fleet_file: Path, name: str) -> Path:
     """
     if re.fullmatch(NAME_PATTERN, name) is None:
         raise ConfigError(
-            f"{name!r} cannot be a test's name, which ends the ids of its runs: letters, digits, dots and "
-            "hyphens, 32 at most, as 'shake-12'"
+            f"{name!r} cannot be a test's name, which ends the ids of its runs: letters, digits and hyphens, "
+            "32 at most, as 'shake-12'"
         )
     return fleet_file.resolve().parent / "tests" / name
 

@@ -1,5 +1,6 @@
 """``bricktrack combine``: the runs of one shake into the motion of assemblies."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -7,8 +8,8 @@ import typer
 from rich.table import Table
 
 from bricktrack_common.errors import ConfigError
-from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest
-from bricktrack_host.campaign.test_plan import PLAN_NAME, folder_of_test
+from bricktrack_common.run_manifest import MANIFEST_NAME, RUN_ID_PATTERN, read_manifest
+from bricktrack_host.campaign.test_plan import PLAN_NAME
 from bricktrack_host.cli._console import out, print_json
 from bricktrack_host.cli._progress import stage_of_counts
 from bricktrack_host.cli._units import FleetOption, JsonOption, fleet_path
@@ -47,7 +48,9 @@ def combine(
 
     path = fleet_path(fleet)
     config = load_fleet(path)
-    folder = output or folder_of_test(path, name)
+    if re.fullmatch(RUN_ID_PATTERN, name) is None:
+        raise ConfigError(f"--name {name!r}: expected letters, digits, '.', '-' and '_', as 'shake-12'")
+    folder = output or path.resolve().parent / "tests" / name
     if (folder / PLAN_NAME).exists():
         raise ConfigError(
             f"{folder} is a planned test's: 'bricktrack test report {name}' combines its runs. For others "

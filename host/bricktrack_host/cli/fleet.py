@@ -1,12 +1,13 @@
 """``bricktrack arm`` and ``disarm``."""
 
+import re
 import time
 from typing import Annotated
 
 import typer
 
-from bricktrack_common.errors import BricktrackError
-from bricktrack_common.wire_messages import Armed, RunSummary, StatusReply
+from bricktrack_common.errors import BricktrackError, ConfigError
+from bricktrack_common.wire_messages import LABEL_PATTERN, Armed, RunSummary, StatusReply
 from bricktrack_host.cli._acknowledged import ask_for, error_details, report_answers
 from bricktrack_host.cli._console import err, out, plain, print_json, say_error
 from bricktrack_host.cli._errors import EXIT_ERROR
@@ -52,6 +53,10 @@ def arm(
 
         bricktrack arm --address tcp://10.0.0.21:41733
     """
+    if re.fullmatch(LABEL_PATTERN, label) is None:
+        raise ConfigError(
+            f"--label {label!r}: expected letters, digits, '-' and '_', 32 at most, as 'shake-07'"
+        )
     chosen = choose_units(fleet, unit, address, timeout_s=timeout)
     answers = ask_for(chosen, lambda c: c.client.arm(label, duration_s=duration), doing="arming")
     all_armed = report_answers(

@@ -141,8 +141,8 @@ def list_keys(file: FileOption = None, fleet: FleetOption = None, as_json: JsonO
         shown = fingerprint(unit.server_key) if unit.server_key else "[yellow]no key[/]"
         table.add_row(unit.name, unit.address, shown)
     out.print(table)
-    words = f"this host: {fingerprint(own)}" if own else f"this host has no key: there is no {path}"
-    out.print(words, markup=False)
+    words = f"this host: {fingerprint(own)}" if own else _no_key(path)
+    out.print(words, markup=False, soft_wrap=True)
 
 
 @app.command()
@@ -263,8 +263,12 @@ def _key_path(file: Path | None, fleet: Fleet | None) -> Path:
 
 def _own_key(path: Path) -> KeyPair:
     if not path.exists():
-        raise ConfigError(f"{path}: this host has no key yet. Make it with 'bricktrack keys create'")
+        raise ConfigError(_no_key(path))
     return read_secret_key(path)
+
+
+def _no_key(path: Path) -> str:
+    return f"{path}: this host has no key yet. Make it with 'bricktrack keys create'"
 
 
 def _fleet_if_any(fleet_file: Path | None) -> Fleet | None:

@@ -89,7 +89,7 @@ class ControlPage:
             self._label = ui.input(
                 "Label of the runs",
                 placeholder="shake-07",
-                validation={"letters, digits, dots and hyphens, 32 at most": _is_label},
+                validation={"letters, digits and hyphens, 32 at most": _is_label},
             ).classes("field")
             self._duration = ui.number("Seconds, if not the units' own", min=0.1, max=600).classes("field")
             with ui.row():
