@@ -65,13 +65,13 @@ plain = st.recursive(
 )  # fmt: skip
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.integers(0, 2**53), requests)
 def test_requests_round_trip(request_id, body):
     assert decode_request(encode_message(request_id, body)) == (request_id, body)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(st.binary(max_size=300))
 def test_arbitrary_bytes_are_refused(data):
     for decode in (decode_request, decode_reply):
@@ -79,7 +79,7 @@ def test_arbitrary_bytes_are_refused(data):
             decode(data)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(plain)
 def test_well_formed_nonsense_is_refused(value):
     for wrapped in (value, {"protocol": 2, "minor": 0, "request_id": 1, "body": value}):
@@ -88,7 +88,7 @@ def test_well_formed_nonsense_is_refused(value):
                 decode(msgpack.packb(wrapped))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(requests, st.text(max_size=8), plain)
 def test_an_unknown_key_or_a_wrong_type_is_refused(body, key, value):
     fields = msgspec.to_builtins(body)
