@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from math import comb
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
@@ -103,6 +102,8 @@ def _bridge_clipped(t_s: FloatArray, acc: FloatArray, limit: float) -> tuple[Flo
             sd[near] = limit
             continue
         sign = np.sign(acc[near, axis])
+        from scipy.interpolate import CubicSpline  # which takes long to load, and few runs are clipped
+
         bridge = sign * CubicSpline(t_s[others], acc[others, axis])(t_s[near])
         is_clipped = (size[near] >= _CLIP_SHARE * limit) | (bridge > limit)
         clipped, sign, bridge = near[is_clipped], sign[is_clipped], bridge[is_clipped]

@@ -6,12 +6,11 @@ matrices.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PPoly
 
 from bricktrack_common.arrays import FloatArray
+from bricktrack_host.fusion.inertial.cubic_pieces import CubicPieces, cubic_through
 from bricktrack_host.fusion.inertial.imu_samples import BRIDGE_PERIODS, bridge_error, fill_instants, roughness
 
 GAP_PERIODS = 1.5  # an interval longer than this holds a missing sample
@@ -23,7 +22,7 @@ _SMOOTH = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 def _second_and_third(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of samples by five points, shape (n, 3) each."""
     step = float(np.median(np.diff(t_s)))
-    at = CubicSpline(t_s, values)
+    at = cubic_through(t_s, values)
     far_before, before, after, far_after = (
         at(np.clip(t_s + k * step, t_s[0], t_s[-1])) for k in (-2, -1, 1, 2)
     )
@@ -34,7 +33,7 @@ def _second_and_third(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, 
 
 def _spline(
     t_s: FloatArray, values: FloatArray, period_s: float, fill: tuple[FloatArray, FloatArray] | None
-) -> CubicSpline[Any]:
+) -> CubicPieces:
     """Return the cubic through samples and the fill's instants and values, shape (m,) and (m, 3).
 
     In a long gap without a fill, points on the chord keep it from swinging across.
@@ -50,7 +49,7 @@ def _spline(
             at = values[i] + share * (values[i + 1] - values[i])
         knots = np.insert(knots, i + 1, between)
         at_knots = np.insert(at_knots, i + 1, at, axis=0)
-    return CubicSpline(knots, at_knots)
+    return cubic_through(knots, at_knots)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,30 +128,30 @@ class SampledVector:
         return np.asarray(np.linalg.norm(self.slow - np.median(self.slow, axis=0), axis=1))
 
     @cached_property
-    def spline(self) -> PPoly[Any]:
+    def spline(self) -> CubicPieces:
         """Return the signal."""
         if self.parts:
             return self._sum([part.spline for _, part in self.parts])
         return _spline(self.t_s, self.values, self.period_s, self.fill)
 
     @cached_property
-    def once(self) -> PPoly[Any]:
+    def once(self) -> CubicPieces:
         """Return its integral."""
         if self.parts:
             return self._sum([part.once for _, part in self.parts])
         return self.spline.antiderivative()
 
     @cached_property
-    def twice(self) -> PPoly[Any]:
+    def twice(self) -> CubicPieces:
         """Return its double integral."""
         if self.parts:
             return self._sum([part.twice for _, part in self.parts])
-        return self.spline.antiderivative(2)
+        return self.once.antiderivative()
 
-    def _sum(self, of_parts: list[PPoly[Any]]) -> PPoly[Any]:
+    def _sum(self, of_parts: list[CubicPieces]) -> CubicPieces:
         turns = [turn.T for turn, _ in self.parts]
         c = np.sum([piece.c @ turn for turn, piece in zip(turns, of_parts, strict=True)], axis=0)
-        return PPoly(c, of_parts[0].x)
+        return CubicPieces(of_parts[0].x, c)
 
     @cached_property
     def _second_and_third(self) -> tuple["SampledVector", "SampledVector"]:

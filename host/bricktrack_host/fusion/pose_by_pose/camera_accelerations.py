@@ -6,7 +6,6 @@ the positions, which neighbouring differences share, is known; with it the compa
 """
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.linalg import cholesky_banded, solve_banded
 from scipy.ndimage import uniform_filter1d
 
@@ -112,6 +111,8 @@ class CameraAccelerations:
         return np.asarray(later - (values[k + 1] - values[k]) / dt[k].reshape(shape))
 
     def _felt(self, acc_camera_mps2: FloatArray) -> FloatArray:
+        from scipy.interpolate import CubicSpline  # which takes long to load; most cameras stand still
+
         return self._second_difference(CubicSpline(self._t_s, acc_camera_mps2).antiderivative(2)(self._tau_s))
 
     def _white(self, values: FloatArray) -> FloatArray:

@@ -40,7 +40,7 @@ def carried_by_spline(
         Turns in brick axes and shifts.
     """
     n = len(t_s)
-    slopes, at = _knot_slopes(samples, t_s), np.empty(6)
+    slopes, at = knot_slopes(samples, t_s), np.empty(6)
     for i in range(n):
         for k in range(led_t_s.shape[1]):
             t, j = led_t_s[i, k], min(i, n - 2)
@@ -60,7 +60,7 @@ def carried_by_spline(
 
 
 @compiled
-def _knot_slopes(y: FloatArray, t: FloatArray) -> FloatArray:
+def knot_slopes(y: FloatArray, t: FloatArray) -> FloatArray:
     """Return a cubic spline's slopes at its knots, (n, m), of values (n, m).
 
     Its third derivative goes through the second and the last but one knot; of three knots it is a parabola,
