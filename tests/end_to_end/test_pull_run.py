@@ -230,7 +230,8 @@ def test_a_file_wrong_twice_is_a_transfer_error(source, here):
             pull(unit, here)
         assert unit.confirmed == set()
     assert not (here / RUN).exists()
-    assert (here / f"{RUN}.bad-2.frames.msgpack").exists()
+    assert (here / f"{RUN}.bad-1.frames.msgpack").exists()
+    assert not (here / f"{RUN}.bad-2.frames.msgpack").exists()  # it was the same
 
 
 def alter_description(change):

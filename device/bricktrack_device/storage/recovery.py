@@ -41,6 +41,7 @@ from bricktrack_device.storage.run_writer import DRAFT_NAME, PARTIAL_SUFFIX
 logger = logging.getLogger(__name__)
 
 DAMAGED_SUFFIX = ".damaged"
+_CUT_OFF = "no whole manifest was on the card: saving was cut off, or the card lost it; what is there is here"
 
 T = TypeVar("T")
 
@@ -169,7 +170,8 @@ def describe_anew_if_altered(store: RunStore, run_id: str) -> list[str]:
     return altered
 
 
-def _finish(folder: Path, run_id: str, store: RunStore, words: Sequence[str] = ()) -> None:
+def _finish(folder: Path, run_id: str, store: RunStore, why: Sequence[str] = (_CUT_OFF,)) -> None:
+    """Give a folder its final name, with a manifest made anew where its own is not whole, and say why."""
     if not _is_whole(folder):
         manifest = rebuild_manifest(folder, run_id, store.unit)
         found = {p.name: _entry(p) for p in sorted(folder.iterdir()) if _is_run_file(p)}
@@ -178,7 +180,7 @@ def _finish(folder: Path, run_id: str, store: RunStore, words: Sequence[str] = (
         ]
         manifest = msgspec.structs.replace(
             manifest,
-            missing=[*manifest.missing, *words, *unreadable],
+            missing=[*manifest.missing, *why, *unreadable],
             files=[entry for entry in found.values() if entry],
         )
         store.disk.write_file(folder / MANIFEST_NAME, lambda f: f.write(dump_json(manifest)))
@@ -216,9 +218,7 @@ def rebuild_manifest(folder: Path, run_id: str, unit: str) -> RunManifest:
     must do, and the manifest says so. A stream that cannot be read is renamed, so that it stands in nobody's
     way and is still there.
     """
-    missing = [
-        "no whole manifest was on the card: saving was cut off, or the card lost it; what is there is here"
-    ]
+    missing: list[str] = []
     imus: list[ImuDescription] = []
     t0_ns: int | None = None
     for path in sorted(folder.glob("imu_*.msgpack")):

@@ -223,7 +223,7 @@ class _RunTransfer:
             )
 
     def _fetch_file(self, client: UnitClient, part: PartFolder, index: int, file: FileSummary) -> None:
-        found_before = ""
+        found_before = problem_before = ""
         for attempt in (1, 2):
             try:
                 missing = part.missing_chunks(file.name, self.chunk_bytes)
@@ -246,12 +246,13 @@ class _RunTransfer:
                 f"{file.sha256[:12]}...; kept as {kept}"
             )
             if found == found_before:
-                raise _AlteredError(f"{problem}. Twice: the unit's card is suspect", file.name, found)
+                kept.unlink()  # the first copy says it all
+                raise _AlteredError(f"{problem_before}. Twice: the unit's card is suspect", file.name, found)
             if attempt == 2:
                 raise TransferError(
                     f"{problem}. Twice, and not the same: the unit's card or memory is suspect"
                 )
-            found_before = found
+            found_before, problem_before = found, problem
             self._note(f"{problem}; fetching it again")
 
     def _check_manifest(self, path: Path, description: RunDescription) -> None:
