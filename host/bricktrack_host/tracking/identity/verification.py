@@ -258,13 +258,18 @@ def _beyond(uv: FloatArray, poses: RefinedPoses, gate: FloatArray) -> tuple[Floa
 
 def in_line(given: BoolArray, brick_model: BrickModel) -> BoolArray:
     """Tell which sets of LEDs (n, n_leds) stand in one line: they have no pose, whatever fits them."""
-    # Most frames show the same LEDs.
-    _, first, of = np.unique(np.packbits(given, axis=1), axis=0, return_index=True, return_inverse=True)
-    given = given[first]
-    P = np.where(given[..., None], brick_model.led_positions_mm, 0.0)
-    middle = P.sum(axis=1, keepdims=True) / np.maximum(given.sum(axis=1), 1)[:, None, None]
-    size = np.linalg.svd(np.where(given[..., None], P - middle, 0.0), compute_uv=False)
-    return np.asarray((size[:, 1] <= _SLIM * size[:, 0])[of.reshape(-1)])
+    out = np.zeros(len(given), dtype=bool)
+    if not len(given):
+        return out
+    # Most frames show the same LEDs: once for them, and once for each that shows others.
+    same = (given == given[0]).all(axis=1)
+    sets = np.concatenate([given[:1], given[~same]])
+    P = np.where(sets[..., None], brick_model.led_positions_mm, 0.0)
+    middle = P.sum(axis=1, keepdims=True) / np.maximum(sets.sum(axis=1), 1)[:, None, None]
+    size = np.linalg.svd(np.where(sets[..., None], P - middle, 0.0), compute_uv=False)
+    is_line = size[:, 1] <= _SLIM * size[:, 0]
+    out[same], out[~same] = is_line[0], is_line[1:]
+    return out
 
 
 def identity_gate_px(radius_px: float) -> float:

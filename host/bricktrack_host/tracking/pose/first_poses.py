@@ -116,8 +116,12 @@ def _other_starts(
     ambiguous[i[row[np.linalg.norm(turn, axis=1) > SAME_POSE_RAD]]] = True
     believe_neighbours(ambiguous, R_out, t_out, R_try, t_try, chi2, frames, t_ns)
     R_out[ambiguous] = np.nan
-    collar_mm = collar_of(brick_model)
-    return refine_poses(uv, cov, R_out, t_out, ray_model, brick_model, collar_mm=collar_mm), ambiguous
+    changed = frames[((R_out != poses.R_camera_brick) | np.isnan(R_out)).any(axis=(1, 2))[frames]]
+    again = refine_poses(
+        uv[changed], cov[changed], R_out[changed], t_out[changed], ray_model, brick_model,
+        collar_mm=collar_of(brick_model),
+    )  # fmt: skip
+    return poses.replaced(changed, again), ambiguous
 
 
 def _poses_from_three(
