@@ -20,10 +20,11 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="bricktrackd",
-    help="The acquisition daemon of a brick unit.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 ConfigOption = Annotated[
@@ -74,6 +75,24 @@ _START_TEST_EPILOG = """Examples:
 
 
 app.add_typer(keys_cli.app)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"bricktrackd {version('bricktrack')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True),
+    ] = False,
+) -> None:
+    """The acquisition daemon of a brick unit."""  # noqa: D401 - what the help begins with
 
 
 @app.command(epilog=_RUN_EPILOG)

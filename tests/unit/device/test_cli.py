@@ -1,3 +1,4 @@
+import importlib.metadata
 import json
 import subprocess
 import sys
@@ -32,6 +33,11 @@ def test_an_error_is_one_line_and_status_1(arguments: list[str], words: str) -> 
 def test_help_has_an_example(command: str) -> None:
     done = bricktrackd(command, "--help")
     assert done.returncode == 0 and f"bricktrackd {command}" in done.stdout.split("Example", 1)[1]
+
+
+def test_the_version_is_the_host_s_too() -> None:
+    done = bricktrackd("--version")
+    assert (done.returncode, done.stdout) == (0, f"bricktrackd {importlib.metadata.version('bricktrack')}\n")
 
 
 def test_importing_the_command_line_stays_small() -> None:
