@@ -3,7 +3,6 @@
 import itertools
 
 import zmq
-from zmq.utils.monitor import parse_monitor_message
 
 _numbers = itertools.count()
 _EVENTS = (
@@ -79,6 +78,9 @@ class HandshakeWatch:
             self._events = None
 
     def _hear(self) -> None:
+        # It loads asyncio and TLS, which no command needs but those that talk with units.
+        from zmq.utils.monitor import parse_monitor_message
+
         while self._events is not None and self._events.poll(0):
             event = parse_monitor_message(self._events.recv_multipart())["event"]
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
