@@ -28,7 +28,7 @@ from bricktrack_host.fusion.estimate import (
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_by_led.led_smoothing import LedStart, SmoothedLeds, smooth_leds
+from bricktrack_host.fusion.led_by_led.led_smoothing import LedSmoother, SmoothedLeds
 from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion
 from bricktrack_host.fusion.pose_by_pose.moving_camera import CameraAlignment, CameraImu
 from bricktrack_host.tracks import ImuTrack, LedObservations, OpticalTrack
@@ -54,6 +54,8 @@ class TightResult:
         LEDs left out as outliers.
     centroid_noise_scale : float
         What the stated sd of the centroids had to be multiplied by.
+    led_offset_sd_px : float
+        How far single LEDs lie beside where layout and profile have them, all over the run.
     """
 
     fused: FusionResult
@@ -62,6 +64,7 @@ class TightResult:
     led_chi2: FloatArray
     led_rejected: BoolArray
     centroid_noise_scale: float
+    led_offset_sd_px: float
 
 
 def fuse_tight(
@@ -112,11 +115,12 @@ def fuse_tight(
     item = FusionInput(optical, imu, lever_arm_mm, output_t_ns, alignment, camera_imu, camera_alignment)
     first = smooth_one(item, settings)
     pose_level = fused_result(item, first, settings)
-    start = LedStart.of(SeenLeds.of(observations, ray_model), first, ray_model, brick_model, settings)
-    del first  # memory need not hold both smoothers
-    arm_m = np.asarray(lever_arm_mm, dtype=np.float64) * 1e-3
-    done = smooth_leds(start, ray_model, brick_model, lever_arm_m=arm_m, settings=settings)
-    return tight_result(observations, item, pose_level, done, settings)
+    smoother = LedSmoother(
+        SeenLeds.of(observations, ray_model), first, ray_model, brick_model,
+        lever_arm_m=np.asarray(lever_arm_mm, dtype=np.float64) * 1e-3, settings=settings,
+    )  # fmt: skip
+    del first  # memory holds one smoother
+    return tight_result(observations, item, pose_level, smoother.smooth(), settings)
 
 
 def tight_result(
@@ -152,4 +156,4 @@ def tight_result(
         clocks, frame_chi2=pose_level.frame_chi2, frame_rejected=pose_level.frame_rejected,
         rotation_noise_scale=scale, position_noise_scale=scale, pose_level=pose_level.track, check=check,
     )  # fmt: skip
-    return TightResult(fused, pose_level, check, chi2_of_led, rejected, scale)
+    return TightResult(fused, pose_level, check, chi2_of_led, rejected, scale, done.errors.offset_sd_px)

@@ -31,6 +31,7 @@ from bricktrack_host.tracks import FusedTrack, LedObservations, OpticalTrack
 
 _RETIME_PASSES = 1
 _MUCH_REJECTED = 0.01  # of the LED centroids; a spark or a glint now and then harms nothing
+_MUCH_OFFSET_PX = 0.15
 # How far samples are to be believed, how far scales are off, and what a vibration leaves in samples decides
 # about dropouts and impacts. Within a frame's 20 ms it cannot be seen (`scripts/bench_retime.py`).
 _WITHIN_FRAMES = FusionSettings(
@@ -211,6 +212,7 @@ def _fuse_tight(
         camera_imu=inertial.camera, camera_alignment=inertial.camera_alignment,
     )  # fmt: skip
     problems.extend(words_on_rejected(tight.led_rejected, np.isfinite(tight.led_chi2)))
+    problems.extend(words_on_led_offsets(tight.led_offset_sd_px))
     if not tight.check.agrees:
         problems.append(
             f"fusion LED by LED and pose by pose are up to {tight.check.max_mm:.2f} mm apart, in "
@@ -227,6 +229,17 @@ def words_on_rejected(is_rejected: BoolArray, is_fused: BoolArray) -> list[str]:
     return [
         f"{n} of {n_seen} LED centroids ({100 * n / n_seen:.1f} %) disagree with all the others and were "
         "left out"
+    ]
+
+
+def words_on_led_offsets(sd_px: float) -> list[str]:
+    """Return what to say of LEDs that lie beside their places throughout; a few hundredths are usual."""
+    if sd_px <= _MUCH_OFFSET_PX:
+        return []
+    return [
+        f"single LEDs lie some {sd_px:.2f} px (sd) beside where layout and profile have them, all over the "
+        "run (0.05 px are usual): poses may be as wrong throughout. Are the LEDs where the layout has them "
+        "(`bricktrack calibrate leds --positions` finds out), clean, and all of one type?"
     ]
 
 

@@ -47,6 +47,15 @@ def test_frames_without_a_pose_are_counted_too(shake):
     assert f"at frame {AT} " in words
 
 
+@pytest.mark.parametrize(("off_px", "n_told"), [(0.3, 0), (0.02, 1)])
+def test_a_step_where_an_led_goes_that_stood_beside_its_place_is_no_knock(shake, off_px, n_told):
+    optical = knocked(shake.optical, [1.2, -1.5, 0.6])
+    residual_px = np.zeros((len(optical.t_ns), 7, 2))
+    residual_px[:, 2, 0] = off_px
+    residual_px[AT - 3 : AT + 20, 2] = np.nan
+    assert len(told(replace(optical, residual_px=residual_px), shake.imu)) == n_told
+
+
 def test_a_gyro_whose_scale_is_off_is_no_knock(shake):
     assert told(shake.optical, replace(shake.imu, gyro_radps=1.01 * shake.imu.gyro_radps)) == []
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.pose_by_pose.moving_camera import align_both
 from bricktrack_host.stages.clocks import Inertial
-from bricktrack_host.stages.motion import OutputGrid, fuse_run, words_on_rejected
+from bricktrack_host.stages.motion import OutputGrid, fuse_run, words_on_led_offsets, words_on_rejected
 from bricktrack_host.tracking.optical_track import solve_poses
 
 
@@ -45,3 +45,8 @@ def test_a_centroid_left_out_now_and_then_is_no_point_to_read():
     rejected.ravel()[2:4] = True
     assert "4 of 240 LED centroids (1.7 %)" in words_on_rejected(rejected, fused)[0]
     assert words_on_rejected(rejected[:0], fused[:0]) == []
+
+
+def test_leds_beside_their_places_are_told_beyond_what_is_usual():
+    assert words_on_led_offsets(0.05) == []
+    assert "0.26 px" in words_on_led_offsets(0.264)[0]
