@@ -81,6 +81,25 @@ def test_a_partly_covered_led_is_flagged_and_no_other(observed):
     assert np.argwhere(covered).tolist() == [[6, 3]]
 
 
+def test_lights_are_doubted_by_their_shape_in_radii(run, observed, monkeypatch):
+    asked = {}
+
+    def doubt(log_area_ratio, cov_px2, usable, R, t_mm):
+        asked.update(usable=usable, t_mm=t_mm)
+        return np.where(np.arange(7) == 4, 0.01, 0.0) * np.ones((len(R), 1))
+
+    monkeypatch.setattr(led_tracker, "doubt_by_shape", doubt)
+    doubted = observe_leds(iter(run), CAMERA, BRICK, sensor_timestamp_ns=STAMPS, exposure_ns=EXPOSURE)
+    more_px2 = doubted.cov_px2[0] - observed.cov_px2[0]
+    np.testing.assert_allclose(more_px2[4], 1e-4 * observed.area_px2[0, 4] / np.pi * np.eye(2), rtol=1e-9)
+    assert not np.delete(more_px2, 4, axis=0).any()
+    # Ten frames have poses; the LEDs that are hidden in frame 2, or covered in frame 6, are not asked about.
+    posed = [0, 1, 2, 3, 4, 6, 8, 9, 10, 11]
+    # Identity takes rows for seen one after the other, and these were not: its poses are off by millimetres.
+    np.testing.assert_allclose(asked["t_mm"], moving_poses()[1][posed], atol=2.0)
+    assert np.argwhere(~asked["usable"]).tolist() == [[2, 0], [2, 5], [5, 3]]
+
+
 def test_the_poses_are_true_to_micrometres(observed):
     track = solve_poses(observed, CAMERA, BRICK, rolling_shutter=False)
     _, t = moving_poses()
