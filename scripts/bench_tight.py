@@ -38,7 +38,7 @@ from bricktrack_host.fusion.believed_errors import MeanBand, draw_pose_errors, p
 from bricktrack_host.fusion.estimate import FusionInput, fuse, fused_result, smooth_one
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_by_led.led_smoothing import LedStart, smooth_leds
+from bricktrack_host.fusion.led_by_led.led_smoothing import LedSmoother
 from bricktrack_host.fusion.pose_by_pose.fused_output import common_part
 from bricktrack_host.fusion.smoothing.smoother_kernel import CHI2_6_95
 from bricktrack_host.fusion.tight import fuse_tight, tight_result
@@ -129,9 +129,8 @@ def honesty_of(seed: int) -> dict[str, Honesty]:
     t_ns = np.arange(optical.t_ns[5], optical.t_ns[-5], STEP_NS)
     item = FusionInput(optical, run.imu, run.lever_arm_mm, t_ns)
     first, leds = smooth_one(item, settings), SeenLeds.of(run.observations, run.camera)
-    start = LedStart.of(leds, first, run.camera, run.brick, settings)
     arm_m = run.lever_arm_mm * 1e-3
-    done = smooth_leds(start, run.camera, run.brick, lever_arm_m=arm_m, settings=settings)
+    done = LedSmoother(leds, first, run.camera, run.brick, lever_arm_m=arm_m, settings=settings).smooth()
     tight = tight_result(run.observations, item, fused_result(item, first, settings), done, settings)
     since = run.world.since_first_edge_s(t_ns)
     is_dropout = np.any([(since > a) & (since < a + d) for a, d in DROPOUTS], axis=0)

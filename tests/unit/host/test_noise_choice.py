@@ -8,6 +8,7 @@ from brick_shakes import LEVER_ARM_MM, simulate_shake
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.estimate import FusionInput, fuse, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.pose_by_pose.noise_choice import frame_chi2
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 
 
@@ -32,6 +33,22 @@ def test_few_sharp_frames_of_a_shift_without_turning_are_fused():
     _, t_mm = s.truth(track.t_ns)
     # The motion is of millimetres, the frames lie 0.2 s apart.
     assert np.sqrt(((track.t_camera_brick_mm - t_mm) ** 2).mean()) < 0.05
+
+
+def test_a_frame_whose_covariance_rounding_has_lost_is_still_judged():
+    s = simulate_shake(7, duration_s=1.5)
+    item = FusionInput(s.optical, s.imu, LEVER_ARM_MM, s.optical.t_ns)
+    done = smooth_poses([prepare_run(item, FusionSettings())], FusionSettings())[0]
+
+    def chi2(covariance):
+        estimate = replace(done.estimate, covariance=covariance)
+        return frame_chi2(done.problem, done.passed, estimate, 0, done.nodes, done.used)[2]
+
+    lost = done.estimate.covariance.copy()
+    lost[done.nodes.node_of_frame[9], 0, 4, 4] = np.nan
+    found, whole = chi2(lost), chi2(done.estimate.covariance)
+    np.testing.assert_array_equal(np.delete(found, 9), np.delete(whole, 9))
+    assert 0 < found[9] < 12.59 and found[9] != whole[9]
 
 
 def test_a_gyro_that_vibrates_is_not_taken_for_noise():

@@ -11,7 +11,7 @@ from bricktrack_host.fusion.estimate import FusionInput, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led import led_smoothing, standing_errors
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
-from bricktrack_host.fusion.led_by_led.led_smoothing import LedStart, smooth_leds
+from bricktrack_host.fusion.led_by_led.led_smoothing import LedSmoother
 from bricktrack_host.fusion.led_by_led.standing_errors import StandingPrior, StandingWay, _likeliest
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.fusion.smoothing.smoother import POS, Filter
@@ -26,8 +26,8 @@ def smoothed(run):
     item = FusionInput(optical, run.imu, run.lever_arm_mm, optical.t_ns[5:-5])
     first = smooth_poses([prepare_run(item, SETTINGS)], SETTINGS)[0]
     leds = SeenLeds.of(run.observations, run.camera)
-    start = LedStart.of(leds, first, run.camera, run.brick, SETTINGS)
-    return smooth_leds(start, run.camera, run.brick, lever_arm_m=run.lever_arm_mm * 1e-3, settings=SETTINGS)
+    arm_m = run.lever_arm_mm * 1e-3
+    return LedSmoother(leds, first, run.camera, run.brick, lever_arm_m=arm_m, settings=SETTINGS).smooth()
 
 
 def plain_run():
@@ -45,14 +45,14 @@ def origin_m(states):
 def plain():
     """Return a run without standing errors, and its last pass, with what it was made of."""
     passes = []
-    whole = led_smoothing._pass
+    whole = LedSmoother._pass
 
     def keep(*args):
         passes.append(whole(*args))
         return passes[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(led_smoothing, "_pass", keep)
+        patch.setattr(LedSmoother, "_pass", keep)
         done = smoothed(plain_run())
     return done, passes[-1]
 

@@ -63,10 +63,10 @@ class SampledVector:
     fill : (ndarray, ndarray) or None
         Instants and values, shape (m,) and (m, 3), that stand for samples missing in long gaps.
     parts : tuple of (ndarray, SampledVector)
-        Vectors, each with a matrix, shape (3, 3), of which it is the sum: so are then its splines. None: it
-        was sampled itself.
+        Vectors, each with a matrix, shape (3, 3), of which it is the sum: so are then its splines. The first
+        matrix is what it is turned by. None: it was sampled itself.
     turned_from : SampledVector or None
-        That of which it is the only part; next to equal, it is as rough.
+        That which was turned; next to equal, it is as rough.
     """
 
     t_s: FloatArray
@@ -149,8 +149,9 @@ class SampledVector:
         return self.once.antiderivative()
 
     def _sum(self, of_parts: list[CubicPieces]) -> CubicPieces:
-        turns = [turn.T for turn, _ in self.parts]
-        c = np.sum([piece.c @ turn for turn, piece in zip(turns, of_parts, strict=True)], axis=0)
+        c = of_parts[0].c @ self.parts[0][0].T
+        for (turn, _), piece in zip(self.parts[1:], of_parts[1:], strict=True):
+            c += piece.c @ turn.T
         return CubicPieces(of_parts[0].x, c)
 
     @cached_property
@@ -168,7 +169,9 @@ class SampledVector:
         if self.turned_from is not None:
             return self.turned_from.turned(turn)
         fill = None if self.fill is None else (self.fill[0], self.fill[1] @ turn.T)
-        return replace(self, values=self.values @ turn.T, fill=fill, parts=((turn, self),), turned_from=self)
+        # Of the same parts as that: its splines, of which nothing else would be made, need not be.
+        parts = tuple((turn @ own, part) for own, part in self.parts) or ((turn, self),)
+        return replace(self, values=self.values @ turn.T, fill=fill, parts=parts, turned_from=self)
 
     def sharpened(self, filter_s: float) -> "SampledVector":
         """Return the vector with the amplitudes that a low-pass took from it, at the times where it put them.

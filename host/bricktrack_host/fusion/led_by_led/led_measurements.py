@@ -1,6 +1,6 @@
 """LEDs one by one as the smoother's measurements: each at its own row's instant, through the ray model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from bricktrack_host.tracking.led_model.led_profile import (
 from bricktrack_host.tracking.led_tracker import NOT_USED
 from bricktrack_host.tracking.optical_track import led_times_ns
 from bricktrack_host.tracks import LedObservations
+
+_PREDICTED_AT_ONCE = 4096  # LEDs: of more the prediction's own arrays are only more memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,8 +142,8 @@ def picture(
     mean_px = 0.5 * (before.uv_px + after.uv_px)
     exposures = 0.5 * leds.exposure_ns / np.maximum(leds.spread_ns, 1.0)
     return Pictured(
-        R_camera_brick=R_camera_brick[0],
-        t_camera_brick_mm=t_camera_brick_mm[0],
+        R_camera_brick=R_camera_brick[0].copy(),  # not a view, which would hold all three
+        t_camera_brick_mm=t_camera_brick_mm[0].copy(),
         residual_px=leds.uv_px - mean_px,
         J_px=_by_pose(prediction, leds, R_camera_brick[0], brick),
         profile_shift_px=shift_per_radius(collar_of(brick), brick) * prediction.model_shift_px,
@@ -183,15 +185,22 @@ def _predict(
     leds: SeenLeds, R: FloatArray, t_mm: FloatArray, ray_model: RayModel, brick: BrickModel
 ) -> LedPrediction:
     """Return predictions of single LEDs, shape (m,), each for its own pose; shifts are of whole radii."""
-    P, N = brick.led_positions_mm[leds.led], brick.led_axes[leds.led]
-    return predict_leds(
-        np.einsum("mij,mj->mi", R, P) + t_mm,
-        np.einsum("mij,mj->mi", R, N),
-        brick.led_radii_mm[leds.led],
-        ray_model,
-        collar_mm=collar_of(brick),
-        shift_sd_per_radius=1.0,
-    )
+    collar_mm, parts = collar_of(brick), []
+    for start in range(0, max(len(leds.led), 1), _PREDICTED_AT_ONCE):
+        some = slice(start, start + _PREDICTED_AT_ONCE)
+        led = leds.led[some]
+        parts.append(
+            predict_leds(
+                np.einsum("mij,mj->mi", R[some], brick.led_positions_mm[led]) + t_mm[some],
+                np.einsum("mij,mj->mi", R[some], brick.led_axes[led]),
+                brick.led_radii_mm[led],
+                ray_model,
+                collar_mm=collar_mm,
+                shift_sd_per_radius=1.0,
+            )
+        )
+    of_all = ([getattr(part, field.name) for part in parts] for field in fields(LedPrediction))
+    return LedPrediction(*(np.concatenate(values) for values in of_all))
 
 
 def _by_pose(prediction: LedPrediction, leds: SeenLeds, R: FloatArray, brick: BrickModel) -> FloatArray:

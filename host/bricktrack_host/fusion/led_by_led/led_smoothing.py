@@ -35,9 +35,10 @@ from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, relinearised
 from bricktrack_host.fusion.smoothing.linearisation import Linearisation
 from bricktrack_host.fusion.smoothing.smoother import POS, Filter, Problem
+from bricktrack_host.fusion.smoothing.standing_doubt import Doubt
 
 _MOST_PASSES = 5
-_NOISE_CHOSEN_IN = 1  # the second pass: there the pictures are predicted from what LEDs say
+_NOISE_CHOSEN_IN = 2  # there the pictures are predicted from what LEDs say
 _STANDS_SDS = 0.2
 """A pass that moves the motion by less is the last. In seven simulated runs 0.13 sd at most were left to go
 after three passes, which makes the errors greater by a hundredth."""
@@ -84,55 +85,6 @@ class _Sights:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LedStart:
-    """All that the LEDs' smoother takes from the pose-level one, which memory need not hold any longer.
-
-    Attributes
-    ----------
-    sights : _Sights
-        Of the LEDs at whose instants that motion is sure enough.
-    run, lin : Run, Linearisation
-    origin_m : ndarray, shape (K, 3)
-        Where the brick's origin was at its nodes.
-    used, scale, levels, chi2
-        As in `Smoothed`.
-    """
-
-    sights: _Sights
-    run: Run
-    lin: Linearisation
-    origin_m: FloatArray
-    used: BoolArray
-    scale: FloatArray
-    levels: tuple[NoiseLevel, NoiseLevel]
-    chi2: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        leds: SeenLeds,
-        first: Smoothed,
-        ray_model: RayModel,
-        brick_model: BrickModel,
-        settings: FusionSettings,
-    ) -> "LedStart":
-        """Return it from the pose-level smoother's states.
-
-        Raises
-        ------
-        TrackingError
-            If these are nowhere sure enough.
-        """
-        placeable = _placeable(leds, first, settings)
-        if not len(placeable.t_ns):
-            raise TrackingError("the motion pose by pose is too unsure to say where any LED should be seen")
-        sights, _ = _sights(placeable, first, ray_model, brick_model)
-        lin = relinearised(first.run, first.estimate, first.b, len(first.nodes.t_s), settings)
-        origin_m = _origin_m(first)[: len(first.nodes.t_s)]
-        return cls(sights, first.run, lin, origin_m, first.used, first.scale, first.levels, first.chi2)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Belief:
     """What is believed of noise and errors when a pass begins."""
 
@@ -171,64 +123,132 @@ class _Pass:
         return not facing.size or bool(np.quantile(facing, _HELD_SHARE) < _PICTURES_HOLD_PX)
 
 
-def smooth_leds(
-    first: LedStart,
-    ray_model: RayModel,
-    brick_model: BrickModel,
-    *,
-    lever_arm_m: FloatArray,
-    settings: FusionSettings,
-) -> SmoothedLeds:
-    """Return the smoothed states, and how far each LED lies from what all others say.
+class LedSmoother:
+    """The smoother LED by LED of one run.
 
-    Pictures are predicted for the pose-level motion, then for what came of it, and so on. Outliers
-    are judged with hindsight each time and may come back; the noise, and errors that stand still, are taken
-    anew from each pass, until what a pass changes is little beside what is not known anyway.
+    It takes of the pose-level one what it needs, which memory need not hold any longer, and of each of its
+    own passes only what the next one needs.
+
+    Parameters
+    ----------
+    leds : SeenLeds
+    first : Smoothed
+        Pose by pose.
+    ray_model, brick_model : RayModel, BrickModel
+    lever_arm_m : ndarray, shape (3,)
+        As it was said to be.
+    settings : FusionSettings
+
+    Raises
+    ------
+    TrackingError
+        If the pose-level motion is nowhere sure enough.
     """
-    n_leds = brick_model.n_leds
-    sights, lin, before_m = first.sights, first.lin, first.origin_m
-    n_views = views_told(sights.pictured)
-    errors = StandingErrors.before(first.run, lever_arm_m, n_leds, n_views=n_views)
-    belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
-    use = np.ones(len(sights.leds.t_ns), dtype=np.bool_)
-    i = 0
-    while True:
-        ready = _prepared(sights, use, lin, first, belief)
-        if i == _NOISE_CHOSEN_IN:
-            noise = choose_inertial_noise(
-                ready.problem, ready.run, ready.nodes, ready.lin, belief.levels, belief.settings
-            )
-            belief = replace(
-                belief, levels=noise.levels(belief.levels), settings=noise.settings(belief.settings)
-            )
-            del ready
-            ready = _prepared(sights, use, lin, first, belief)
-        done = _pass(ready, first, belief)
-        leds, now = sights.leds, done.states
-        moved_sds = _moved_sds(before_m, now)
+
+    def __init__(
+        self,
+        leds: SeenLeds,
+        first: Smoothed,
+        ray_model: RayModel,
+        brick_model: BrickModel,
+        *,
+        lever_arm_m: FloatArray,
+        settings: FusionSettings,
+    ) -> None:
+        placeable = _placeable(leds, first, settings)
+        if not len(placeable.t_ns):
+            raise TrackingError("the motion pose by pose is too unsure to say where any LED should be seen")
+        self._models, self._n_leds = (ray_model, brick_model), brick_model.n_leds
+        self._sights, _ = _sights(placeable, first, *self._models)
+        self._use = np.ones(len(self._sights.leds.t_ns), dtype=np.bool_)
+        self._n_views = views_told(self._sights.pictured)
+        errors = StandingErrors.before(first.run, lever_arm_m, self._n_leds, n_views=self._n_views)
+        self._belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
+        self._of_poses = first.used, first.scale, first.chi2
+        self._go_on_from(first)
+
+    def smooth(self) -> SmoothedLeds:
+        """Return the smoothed states, and how far each LED lies from what all others say.
+
+        Pictures are predicted for the pose-level motion, then for what came of it, and so on. Outliers are
+        judged with hindsight each time and may come back; the noise, and errors that stand still, are taken
+        anew from each pass, until what a pass changes is little beside what is not known anyway.
+        """
+        i = 1
+        while True:
+            done = self._pass(self._prepared(chooses_noise=i == _NOISE_CHOSEN_IN))
+            way, errors = self._errors_after(done)
+            stands = i > _NOISE_CHOSEN_IN and _moved_sds(self._origin_m, done.states) < _STANDS_SDS
+            if stands or i == _MOST_PASSES:
+                return self._with_doubt(done, way.doubt(errors, done.states.estimate.of), errors)
+            self._learn(done, errors)
+            i += 1
+            del done, way
+
+    def _with_doubt(self, done: _Pass, doubt: Doubt, errors: StandingErrors) -> SmoothedLeds:
+        """Return what came of a pass, with what the errors that stand still leave unsure."""
+        states = replace(done.states, estimate=doubt.added_to(done.states.estimate, 0), doubt=doubt)
+        return SmoothedLeds(self._sights.leds, states, done.chi2, done.use, self._belief.scales, errors)
+
+    def _learn(self, done: _Pass, errors: StandingErrors) -> None:
+        """Take from a pass what is believed, and where to linearise, in the next one."""
+        belief, still = self._belief, self._sights.still
+        scales = centroid_scales(done.chi2, still, done.use, belief.scales)
+        more = (scales / belief.scales)[still.astype(np.int64)]
+        self._use = (done.chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
+        run = belief.run.with_sensor(errors.of_sensor(since=belief.errors))
+        self._belief = replace(belief, run=run, scales=scales, errors=errors)
+        if not done.holds():
+            leds = self._sights.leds
+            del self._sights
+            self._sights, placed = _sights(leds, done.states, *self._models)
+            self._use = self._use[placed]
+        self._go_on_from(done.states)
+
+    def _go_on_from(self, now: Smoothed) -> None:
+        """Keep where a motion was, and where to linearise next."""
+        n_nodes = len(now.nodes.t_s)
+        self._lin = relinearised(now.run, now.estimate, now.b, n_nodes, self._belief.settings)
+        self._origin_m = _origin_m(now)[:n_nodes]
+
+    def _errors_after(self, done: _Pass) -> tuple[StandingWay, StandingErrors]:
+        """Return the errors that stand still as a pass tells them, and its way beside them."""
+        now, leds = done.states, self._sights.leds
         still = now.nodes.camera_attitudes(now.run)
         prior = StandingPrior.of(
-            leds, done.pictured, n_leds, settings, n_views=n_views, camera_moves=still is not None
-        )
-        way = StandingWay(
-            now.problem, now.passed, leds, done.pictured, n_leds, n_views=n_views, R_still_camera=still
+            leds, done.pictured, self._n_leds, self._belief.settings, n_views=self._n_views,
+            camera_moves=still is not None,
         )  # fmt: skip
-        errors = way.estimate(prior, belief.errors.value)
-        if i == _MOST_PASSES - 1 or (i > _NOISE_CHOSEN_IN and moved_sds < _STANDS_SDS):
-            doubt = way.doubt(errors, now.estimate.of)
-            states = replace(now, estimate=doubt.added_to(now.estimate, 0), doubt=doubt)
-            return SmoothedLeds(leds, states, done.chi2, done.use, belief.scales, errors)
-        scales = centroid_scales(done.chi2, sights.still, done.use, belief.scales)
-        more = (scales / belief.scales)[sights.still.astype(np.int64)]
-        use = (done.chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
-        run = belief.run.with_sensor(errors.of_sensor(since=belief.errors))
-        belief = replace(belief, run=run, scales=scales, errors=errors)
-        if not done.holds():
-            sights, placed = _sights(leds, now, ray_model, brick_model)
-            use = use[placed]
-        lin, before_m = relinearised(now.run, now.estimate, 0, len(now.nodes.t_s), settings), _origin_m(now)
-        i += 1
-        del ready, done, now, way  # of each pass only what the next one needs: memory holds one
+        way = StandingWay(
+            now.problem, now.passed, leds, done.pictured, self._n_leds, n_views=self._n_views,
+            R_still_camera=still,
+        )  # fmt: skip
+        return way, way.estimate(prior, self._belief.errors.value)
+
+    def _prepared(self, *, chooses_noise: bool) -> _Ready:
+        """Return the problem of the LEDs by what is believed, if asked for with the likeliest noise."""
+        ready = _prepared(self._sights, self._use, self._lin, self._belief)
+        if not chooses_noise:
+            return ready
+        belief = self._belief
+        noise = choose_inertial_noise(
+            ready.problem, ready.run, ready.nodes, ready.lin, belief.levels, belief.settings
+        )
+        self._belief = replace(
+            belief, levels=noise.levels(belief.levels), settings=noise.settings(belief.settings)
+        )
+        del ready
+        return _prepared(self._sights, self._use, self._lin, self._belief)
+
+    def _pass(self, ready: _Ready) -> _Pass:
+        """Smooth once."""
+        passed, (used, scale, chi2) = Filter(ready.problem), self._of_poses
+        estimate = passed.smooth()
+        states = Smoothed(
+            ready.run, ready.nodes, ready.lin, ready.problem, passed, estimate, 0, used=used, scale=scale,
+            levels=self._belief.levels, chi2=chi2, doubt=None,
+        )  # fmt: skip
+        return _Pass(ready.pictured, ready.use, states, led_chi2(ready.problem, estimate))
 
 
 def _moved_sds(before_m: FloatArray, now: Smoothed) -> float:
@@ -244,16 +264,14 @@ def _origin_m(s: Smoothed) -> FloatArray:
     return np.asarray(state.x[:, s.b, POS] - state.R[:, s.b] @ s.run.lever_arm_m)
 
 
-def _prepared(
-    sights: _Sights, use: BoolArray, lin: Linearisation, first: LedStart, belief: _Belief
-) -> _Ready:
+def _prepared(sights: _Sights, use: BoolArray, lin: Linearisation, belief: _Belief) -> _Ready:
     """Return the problem of sights by what is believed."""
     settings, leds, pictured = belief.settings, sights.leds, sights.pictured
     off_px = belief.errors.in_picture_px(leds, pictured)
     pictured = replace(pictured, residual_px=pictured.residual_px - off_px)
     use = use & pictured.is_facing
     run = _without_frames(belief.run.with_acc_loss(lin.loss_s2))
-    nodes = Nodes(place_nodes(first.run, lin).t_s, np.zeros(0, dtype=np.int64))
+    nodes = Nodes(place_nodes(belief.run, lin).t_s, np.zeros(0, dtype=np.int64))
     problem, _ = build_problem(
         [run], [nodes], [lin], settings=settings, use_frame=[np.zeros(0, dtype=np.bool_)],
         noise_scale=[np.ones(2)], levels=[belief.levels],
@@ -263,17 +281,6 @@ def _prepared(
         cov_px2=believed_covariance_px2(leds, sights.still, belief.scales), use=use, settings=settings,
     )  # fmt: skip
     return _Ready(pictured, use, run, nodes, lin, replace(problem, leds=arrays))
-
-
-def _pass(ready: _Ready, first: LedStart, belief: _Belief) -> _Pass:
-    """Smooth once."""
-    passed = Filter(ready.problem)
-    estimate = passed.smooth()
-    states = Smoothed(
-        ready.run, ready.nodes, ready.lin, ready.problem, passed, estimate, 0,
-        used=first.used, scale=first.scale, levels=belief.levels, chi2=first.chi2, doubt=None,
-    )  # fmt: skip
-    return _Pass(ready.pictured, ready.use, states, led_chi2(ready.problem, estimate))
 
 
 def _placeable(leds: SeenLeds, s: Smoothed, settings: FusionSettings) -> SeenLeds:
@@ -289,9 +296,10 @@ def _sights(
     leds: SeenLeds, s: Smoothed, ray_model: RayModel, brick_model: BrickModel
 ) -> tuple[_Sights, BoolArray]:
     """Return the LEDs whose instants a smoothed motion covers, with their pictures, and which those are."""
-    t_ns = np.concatenate([leds.t_ns[None], leds.beside_ns()])
-    R, t_mm = sample_poses(s.run, s.nodes, s.estimate.state, s.b, t_ns.ravel())
-    R, t_mm = R.reshape(*t_ns.shape, 3, 3), t_mm.reshape(*t_ns.shape, 3)
+    instants_ns = np.concatenate([leds.t_ns[None], leds.beside_ns()])
+    R, t_mm = np.empty((*instants_ns.shape, 3, 3)), np.empty((*instants_ns.shape, 3))
+    for i, t_ns in enumerate(instants_ns):
+        R[i], t_mm[i] = sample_poses(s.run, s.nodes, s.estimate.state, s.b, t_ns)
     placed = np.asarray(np.isfinite(t_mm).all(axis=(0, 2)))
     leds = leds.take(placed)
     pictured = picture(leds, R[:, placed], t_mm[:, placed], ray_model, brick_model)

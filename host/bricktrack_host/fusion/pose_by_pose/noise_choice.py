@@ -51,12 +51,14 @@ def frame_chi2(
     The smoothed state holds the frame itself. Taken out of it again: with A = H P H', r the residual and R
     the covariance that the filter gave the frame, the others alone leave R (R - A)^-1 r, and know the frame
     to A + A (R - A)^-1 A. Both are taken along the axes in which R is one and A diagonal. Where A says more
-    than R, the state was linearised too far off to take the frame out: there it is judged as it is.
+    than R, the state was linearised too far off to take the frame out: there it is judged as it is. Where
+    rounding left no A (NaN), a frame is judged by its own covariance alone.
     """
     at = nodes.node_of_frame
     r, H = residuals(problem, estimate.state, at, b)
     H = H[..., estimate.of]
     A = H @ estimate.covariance[at, b] @ np.swapaxes(H, -1, -2)
+    A[~np.isfinite(A).all(axis=(1, 2))] = 0.0
     stated = problem.cov_seen[at, b]
     inflation = passed.inflation[at, b][:, None]
     root = np.linalg.cholesky(stated * inflation[..., None])
