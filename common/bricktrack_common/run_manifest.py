@@ -193,7 +193,7 @@ def parse_manifest(data: bytes, *, where: str) -> RunManifest:
     """Return the manifest in ``data``; see `read_manifest`."""
     try:
         value = msgspec.json.decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError) as e:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as e:
         raise RunFormatError(f"{where}: not valid JSON: {e}") from e
     if not isinstance(value, dict) or value.get("schema") != MANIFEST_SCHEMA:
         raise RunFormatError(f"{where}: not a {MANIFEST_SCHEMA} manifest")

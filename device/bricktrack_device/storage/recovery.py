@@ -119,18 +119,26 @@ def _bring_in(copy: Path, store: RunStore) -> bool:
 
 
 def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
-    """Take up a run again whose manifest is lost, or none any more; one of a newer version is left alone."""
+    """Take up a run again whose manifest is lost, none any more, or another than its draft says.
+
+    One of a newer version is left alone.
+    """
     path = folder / MANIFEST_NAME
     if path.is_file():
         try:
-            parse_manifest(path.read_bytes(), where=str(path))
-            return
+            manifest = parse_manifest(path.read_bytes(), where=str(path))
         except NewerRunError as e:
             logger.warning("%s", e)
             return
-        except (RunFormatError, RecursionError) as e:
-            aside = path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX)
-            logger.warning("%s; kept as %s", e, aside.name)
+        except RunFormatError as e:
+            problem = str(e)
+        else:
+            altered = _differing(manifest, folder)
+            if not altered:
+                return
+            problem = f"{path}: {', '.join(altered)}: not as in {DRAFT_NAME}"
+        aside = path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX)
+        logger.warning("%s; kept as %s", problem, aside.name)
         store.disk.rename(path, aside)
     elif not folder.is_dir() or not any(_is_run_file(p) for p in folder.iterdir()):
         logger.warning("%s: holds nothing of a run; left alone", folder)
@@ -170,7 +178,30 @@ def describe_anew_if_altered(store: RunStore, run_id: str) -> list[str]:
     return altered
 
 
-def _finish(folder: Path, run_id: str, store: RunStore, why: Sequence[str] = (_CUT_OFF,)) -> None:
+def _differing(manifest: RunManifest, folder: Path) -> list[str]:
+    """Return the keys in which a manifest and its draft differ: the card has altered one of them."""
+    try:
+        draft = read_manifest(folder / DRAFT_NAME)
+    except RunFormatError:
+        return []
+    keys = set(draft.__struct_fields__) - {"state", "missing", "files"}
+    return sorted(k for k in keys if getattr(manifest, k) != getattr(draft, k))
+
+
+def _why(folder: Path) -> str:
+    """Return in words why a run has no manifest of its own any more."""
+    try:
+        altered = _differing(read_manifest(folder / (MANIFEST_NAME + DAMAGED_SUFFIX)), folder)
+    except RunFormatError:
+        altered = []
+    if not altered:
+        return _CUT_OFF
+    return (
+        f"the card altered the manifest or its draft: {', '.join(altered)} are the draft's, and may be wrong"
+    )
+
+
+def _finish(folder: Path, run_id: str, store: RunStore, why: Sequence[str] = ()) -> None:
     """Give a folder its final name, with a manifest made anew where its own is not whole, and say why."""
     if not _is_whole(folder):
         manifest = rebuild_manifest(folder, run_id, store.unit)
@@ -180,7 +211,7 @@ def _finish(folder: Path, run_id: str, store: RunStore, why: Sequence[str] = (_C
         ]
         manifest = msgspec.structs.replace(
             manifest,
-            missing=[*manifest.missing, *why, *unreadable],
+            missing=[*manifest.missing, *(why or [_why(folder)]), *unreadable],
             files=[entry for entry in found.values() if entry],
         )
         store.disk.write_file(folder / MANIFEST_NAME, lambda f: f.write(dump_json(manifest)))

@@ -71,6 +71,22 @@ def test_a_run_whose_manifest_is_damaged_is_made_anew_from_its_draft(
     assert newer.read_text().endswith("99}")  # a newer bricktrack reads it
 
 
+@pytest.mark.parametrize("name", ["manifest.json", DRAFT_NAME])
+def test_a_manifest_that_differs_from_its_draft_is_doubted(tmp_path: Path, name: str) -> None:
+    store = store_in(tmp_path)
+    run_id, other = save_one(store), save_one(store)
+    path = tmp_path / "runs" / run_id / name
+    altered = path.read_bytes().replace(b'"t0_ns": 5000000000', b'"t0_ns": 5000000008', 1)
+    assert altered != path.read_bytes()  # one flipped bit, and still a manifest
+    path.write_bytes(altered)
+    assert recover_runs(store_in(tmp_path)) == [run_id]
+    m = read_run(path.parent, verify_hashes=True).manifest
+    assert m.state == "interrupted"
+    assert any("altered the manifest or its draft" in words for words in m.missing)
+    assert recover_runs(store_in(tmp_path)) == []
+    assert read_run(tmp_path / "runs" / other).manifest.state == "complete"
+
+
 def test_a_run_whose_manifest_is_lost_is_taken_up_again_and_no_other_folder(tmp_path: Path) -> None:
     run_id = save_one(store_in(tmp_path))
     (tmp_path / "runs" / run_id / "manifest.json").unlink()
