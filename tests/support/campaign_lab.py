@@ -1,23 +1,15 @@
-"""Two runs of one shake, their combined test, and datasets of it (invented, simulated)."""
+"""Datasets of an invented laboratory, and its test combined again (simulated)."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
-from small_lab import BRICK, UNITS, invented_run
+from small_lab import BRICK, UNITS
 
 from bricktrack_host.assemblies.combined_test import combine_test
 from bricktrack_host.datasets.campaign_dataset import add_units, open_dataset
 from bricktrack_host.datasets.test_sources import sources_of_test
-
-
-def make_lab(folder: Path) -> Path:
-    """Write two runs of one shake and their combined test, ``shake-12``; return the folder."""
-    for unit in UNITS:
-        invented_run(folder / unit, unit)
-    combine(folder)
-    return folder
 
 
 def combine(folder: Path, name: str = "shake-12") -> None:

@@ -5,18 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from small_lab import example, invented_lab
+from small_lab import example
 
 from bricktrack_common.errors import RunFormatError
 from bricktrack_host import analysis
 from bricktrack_host.results.spectra import SpectrumError, amplitude_spectrum
-
-
-@pytest.fixture(scope="module")
-def lab(tmp_path_factory):
-    lab = tmp_path_factory.mktemp("lab")
-    invented_lab(lab)
-    return lab
 
 
 @pytest.fixture(scope="module")

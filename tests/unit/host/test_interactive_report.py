@@ -6,10 +6,11 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from small_lab import example, invented_lab
+from small_lab import example
 from typer.testing import CliRunner
 
 from bricktrack_common.rotations import rvec_from_matrix
@@ -23,13 +24,6 @@ from bricktrack_host.reporting.plots import half_frame_rate_hz
 from bricktrack_host.results.run_summary import key_figures
 
 from .test_report import changed
-
-
-@pytest.fixture(scope="module")
-def lab(tmp_path_factory):
-    lab = tmp_path_factory.mktemp("lab")
-    invented_lab(lab)
-    return lab
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +176,8 @@ def test_a_tests_page_holds_every_component(lab):
 
 @pytest.mark.slow
 def test_the_command_writes_each_page_where_it_says(lab, tmp_path):
+    lab = Path(shutil.copytree(lab, tmp_path / "lab"))
+
     def report(*words):
         done = CliRunner().invoke(app, ["report", *map(str, words)], env={"COLUMNS": "200"})
         return done.exit_code, done.output
@@ -202,7 +198,6 @@ def test_the_command_writes_each_page_where_it_says(lab, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     assert report(empty)[0] == 1
-    shutil.rmtree(empty)
 
 
 def test_half_the_frame_rate_is_that_of_the_frames_there_are(result):

@@ -3,6 +3,8 @@
 The cameras and boards are those of `lens_boards`, written apart from the product.
 """
 
+from functools import cache
+
 import numpy as np
 import pytest
 from lens_boards import (
@@ -63,17 +65,18 @@ def test_the_default_choice_is_as_good():
 
 
 @pytest.mark.slow
+@cache
+def fitted(lens, seed):
+    return fit_central_rays(two_planes(lens, seed), sensor_mode=IMX219_1080P)
+
+
 def test_the_stated_uncertainty_covers_the_truth():
     """Over 24 boards; 50 of each lens, in scripts/bench_ray_models.py, give 93.8 to 94.8 %.
 
     One board's errors hang together over the picture (about 35 numbers a direction), so that its share
     scatters by 4 %; 24 boards know the mean to 1 %.
     """
-    shares = [
-        shares_within_95(fit_central_rays(two_planes(lens, 100 + s), sensor_mode=IMX219_1080P), lens)
-        for lens in LENSES.values()
-        for s in range(8)
-    ]
+    shares = [shares_within_95(fitted(lens, 100 + s), lens) for lens in LENSES.values() for s in range(8)]
     assert 0.925 < np.mean(shares) < 0.975
 
 
@@ -100,7 +103,7 @@ def test_both_planes_points_of_a_ray_vary_together_as_stated():
     uv = np.array([[500.0, 300.0]])
     seen, stated = [], []
     for s in range(30):
-        model = fit_central_rays(two_planes(brown, 300 + s), sensor_mode=IMX219_1080P)
+        model = fitted(brown, 100 + s)
         seen.append(np.concatenate([model.points_on_plane(uv[0], z) for z in (A_MM, B_MM)]))
         stated.append(model.ray_covariance_mm2(uv)[0])
     stated = np.mean(stated, axis=0)
