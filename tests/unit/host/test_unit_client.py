@@ -352,7 +352,7 @@ def test_many_clients_of_one_context_leave_no_socket_behind(runs):
     context.max_sockets = 64  # closed sockets are reaped a little later: some may still count
     with FakeUnit(runs) as unit:
         for _ in range(200):
-            with UnitClient(unit.address, context=context) as client:
+            with UnitClient(unit.address, context=context, timeout_s=60) as client:
                 assert client.hello().unit == "fake"
         with (
             UnitClient("tcp://127.0.0.1:1", context=context, timeout_s=0.05) as client,
