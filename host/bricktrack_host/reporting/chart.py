@@ -223,7 +223,8 @@ class _Scales:
 
 def _whole(position_pt: FloatArray) -> IntArray:
     # Far outside the panel is as good as a little outside, and for NaN, which nobody looks at.
-    return np.rint(np.fmin(np.fmax(position_pt, -_FAR_PT), _FAR_PT) * UNITS_PER_PT).astype(np.int64)
+    near_pt: FloatArray = np.fmin(np.fmax(position_pt, -_FAR_PT), _FAR_PT)
+    return np.rint(near_pt * UNITS_PER_PT).astype(np.int64)
 
 
 def _panel_svg(panel: Panel, x_limits: tuple[float, float], number: int) -> str:
