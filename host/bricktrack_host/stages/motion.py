@@ -149,6 +149,29 @@ def _by_poses(
     )  # fmt: skip
 
 
+def with_times_doubted(observations: LedObservations, time_sd_ns: FloatArray) -> LedObservations:
+    """Return centroids that are as unsure as they move in what their frames' instants are unsure by.
+
+    All LEDs of a frame are early or late together. Fused each for itself they would seem to say so all the
+    more surely, the more there are: so each has as many times the variance.
+
+    Parameters
+    ----------
+    observations : LedObservations
+    time_sd_ns : ndarray, shape (n_frames,), ns
+        As `unsure_stamps` returns it.
+    """
+    uv, t_s = observations.uv_px, observations.sensor_timestamp_ns * 1e-9
+    if len(uv) < 3 or not time_sd_ns.any():
+        return observations
+    speed = np.zeros_like(uv)  # px/s, by the frames on either side
+    speed[1:-1] = np.nan_to_num((uv[2:] - uv[:-2]) / (t_s[2:] - t_s[:-2])[:, None, None])
+    doubt_px = speed * (time_sd_ns * 1e-9)[:, None, None]
+    n_seen = np.isfinite(uv[..., 0]).sum(axis=1)[:, None, None, None]
+    doubt_px2 = n_seen * doubt_px[..., :, None] * doubt_px[..., None, :]
+    return replace(observations, cov_px2=observations.cov_px2 + doubt_px2)
+
+
 def fuse_run(
     optical: OpticalTrack,
     inertial: Inertial | None,

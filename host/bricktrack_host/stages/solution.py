@@ -33,6 +33,7 @@ from bricktrack_host.stages.motion import (
     retime,
     with_ray_errors,
     with_restamped_told,
+    with_times_doubted,
     with_unsure_times,
     words_on_knocks,
 )
@@ -120,7 +121,7 @@ def solve_run(
             _require_poses(optical, run, brick)
         problems += words_on_knocks(optical, inertial)
         grid = output_grid(optical, inertial, edge_fit)
-        seen = (observations, rays) if settings.rolling_shutter else None
+        seen = (with_times_doubted(observations, time_sd_ns), rays) if settings.rolling_shutter else None
         fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
         optical, fused = with_unsure_times(optical, fused, time_sd_ns)
         fused = with_restamped_told(optical, fused)

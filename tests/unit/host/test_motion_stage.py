@@ -8,7 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.pose_by_pose.moving_camera import align_both
 from bricktrack_host.stages.clocks import Inertial
-from bricktrack_host.stages.motion import OutputGrid, fuse_run, words_on_led_offsets, words_on_rejected
+from bricktrack_host.stages.motion import (
+    OutputGrid,
+    fuse_run,
+    with_times_doubted,
+    words_on_led_offsets,
+    words_on_rejected,
+)
 from bricktrack_host.tracking.optical_track import solve_poses
 
 
@@ -50,3 +56,19 @@ def test_a_centroid_left_out_now_and_then_is_no_point_to_read():
 def test_leds_beside_their_places_are_told_beyond_what_is_usual():
     assert words_on_led_offsets(0.05) == []
     assert "0.26 px" in words_on_led_offsets(0.264)[0]
+
+
+def test_centroids_are_as_unsure_as_they_move_in_what_their_frames_are_unsure_by():
+    # 600 px/s along u, 3 of 4 LEDs seen, 0.5 ms: 0.3 px, and three times the variance. The first frame has one side.
+    run = simulate_run(3, duration_s=1.0)
+    uv = np.zeros((4, 4, 2))
+    uv[..., 0] = 100.0 + 20.0 * np.arange(4)[:, None]
+    uv[:, 3] = np.nan
+    seen = replace(
+        run.observations, uv_px=uv, cov_px2=np.tile(0.01 * np.eye(2), (4, 4, 1, 1)),
+        sensor_timestamp_ns=np.arange(4) * 33_333_333,
+    )  # fmt: skip
+    doubted = with_times_doubted(seen, np.full(4, 0.5e6)).cov_px2
+    np.testing.assert_allclose(doubted[1:3, :3], np.tile(np.diag([0.28, 0.01]), (2, 3, 1, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(doubted[[0, 3]], seen.cov_px2[[0, 3]])
+    assert with_times_doubted(seen, np.zeros(4)) is seen
