@@ -66,7 +66,7 @@ def test_offset_is_the_delay_of_slow_motion_however_the_low_pass_bends_it(seed):
     s = simulate_shake(seed, offset_s=0.01, lowpass_hz=23.0, rotation_sd_deg=0.015)
     a = align_times(s.optical, s.imu)
     assert abs(a.offset_ns * 1e-9 - 0.01) < 4 * a.offset_sd_ns * 1e-9
-    assert a.offset_sd_ns < 0.04e6
+    assert a.offset_sd_ns < 0.07e6
 
 
 def test_without_rotation_the_stamps_stand_and_no_offset_is_invented():

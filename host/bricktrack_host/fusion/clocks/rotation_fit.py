@@ -32,6 +32,8 @@ _STEP_TIME_SD_S = 0.02
 LOSS_PRIOR_SD_S2 = 2e-5  # of c: 4.5 ms squared, the BNO055's narrower settings
 DISPERSION_PRIOR_SD_S3 = 5e-8
 """Of d: a second-order low-pass of 7 ms mean delay has 3e-8 (critically damped) to -6e-8 (Butterworth)."""
+_NEXT_TERM_SHARE = 0.25
+"""How unsure terms left out make what d does to the offset: 2 pi f times 3.5 ms, squared, at 23 Hz."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,6 +293,8 @@ class RotationFit:
                 break
         bias, bias_covariance = self._bias(t, segment[inside], attitude, drift, sd * self._sd[inside])
         covariance = np.linalg.inv(normal) * sd**2
+        drawn_s = step[3] * covariance[0, 3] / covariance[3, 3]  # what d did to the offset
+        covariance[0, 0] += (_NEXT_TERM_SHARE * drawn_s) ** 2
         misfit = 3 * float(np.minimum(residual**2, _MISFIT_CAP * sd**2).sum())
         bias_sd = np.sqrt(np.diag(bias_covariance))
         return Fit(offset, skew, lost, self._gyro_bias + bias, bias_sd, covariance, sd, misfit, n)
