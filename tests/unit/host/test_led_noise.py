@@ -5,7 +5,6 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_noise import (
     STATED_SCALES,
@@ -80,14 +79,11 @@ def test_a_run_at_rest_says_nothing_of_pictures_that_move():
 def test_steps_of_inertial_noise_are_factors_of_two_and_few_impacts_are_believed_less():
     noise = InertialNoise(gyro_rough=-1, acc_rough=1, acc_systematic=-2, impact=-2, n_impacts=6)
     gyro, acc = noise.levels((NoiseLevel(1.0, 0.5), NoiseLevel(1.0, 0.5)))
-    assert (gyro, acc) == (NoiseLevel(0.5, 0.5), NoiseLevel(2.0, 0.125))
-    assert noise.n_steps == 6
-    stated = FusionSettings(acc_impact_share=1.0, gyro_impact_share=0.3)
-    told = noise.settings(stated)
     # Variance of Student's t with six degrees of freedom: 6 / 4.
-    assert told.acc_impact_share == pytest.approx(0.25 * np.sqrt(1.5))
-    assert told.gyro_impact_share == pytest.approx(0.075 * np.sqrt(1.5))
-    assert InertialNoise().settings(stated) == stated
+    share = pytest.approx(0.25 * np.sqrt(1.5))
+    assert (gyro.roughness, gyro.systematic, gyro.impact) == (0.5, 0.5, share)
+    assert (acc.roughness, acc.systematic, acc.impact) == (2.0, 0.125, share)
+    assert noise.n_steps == 6
 
 
 def test_an_led_that_nothing_can_be_said_of_does_not_count():

@@ -11,7 +11,7 @@ from bricktrack_common.rotations import skew
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
-from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts
 from bricktrack_host.fusion.smoothing.linearisation import Linearisation
 from bricktrack_host.fusion.smoothing.observation_kernel import LedArrays
 from bricktrack_host.fusion.smoothing.smoother import Estimate, Problem
@@ -210,6 +210,35 @@ def _by_pose(prediction: LedPrediction, leds: SeenLeds, R: FloatArray, brick: Br
     return np.concatenate([-turn, prediction.J_px_per_mm], axis=2)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LedNoise:
+    """What makes the pictures of m LEDs unsure.
+
+    Attributes
+    ----------
+    cov_px2 : ndarray, shape (m, 2, 2)
+        Of the centroids.
+    J : ndarray, shape (m, 2, 6)
+        Derivatives of the pictures by attitude, rad, and position, m.
+    away_s : ndarray, shape (m,)
+        From the node.
+    parts : NoiseParts
+        Between the node and the LED.
+    """
+
+    cov_px2: FloatArray
+    J: FloatArray
+    away_s: FloatArray
+    parts: NoiseParts
+
+    def covariance_px2(self, levels: tuple[NoiseLevel, NoiseLevel]) -> FloatArray:
+        """Return the covariance by levels of gyro and accelerometer, shape (m, 2, 2)."""
+        turn = self.parts.gyro(levels[0]) * self.away_s
+        shift = self.parts.acc(levels[1]) * self.away_s**3 / 3
+        between = np.repeat(np.stack([turn, shift], axis=1), 3, axis=1)
+        return np.asarray(self.cov_px2 + np.einsum("mik,mk,mjk->mij", self.J, between, self.J))
+
+
 def led_arrays(
     leds: SeenLeds,
     pictured: Pictured,
@@ -221,11 +250,12 @@ def led_arrays(
     cov_px2: FloatArray,
     use: BoolArray,
     settings: FusionSettings,
-) -> LedArrays:
+) -> tuple[LedArrays, LedNoise]:
     """Return the smoother's measurements of one run: each LED tied to the node nearest in time.
 
     ``cov_px2``, shape (m, 2, 2), is believed of the centroids; ``use`` says which are shown to the filter.
-    What the inertial samples leave unsure between node and LED is added to the covariance.
+    What the inertial samples leave unsure between node and LED is added to the covariance; the noise given
+    beside tells what other levels make of it.
     """
     t_cam_s = seconds_since(leds.t_ns, run.signal.epoch_ns)
     t_s = run.imu_time_s(t_cam_s, lin)
@@ -250,12 +280,9 @@ def led_arrays(
         turned = run.camera.still_omega_radps(t_s)
         felt = run.camera.increments(start_s, t_s, acc_lag_s=lin.lag_s)[:, :2]
     parts = run.noise_parts(np.sort(np.stack([start_s, t_s]), axis=0), lin, settings)
-    turn = parts.gyro(levels[0]) * np.abs(dt)
-    shift = parts.acc(levels[1]) * np.abs(dt) ** 3 / 3
-    between = np.repeat(np.stack([turn, shift], axis=1), 3, axis=1)
-    cov = cov_px2 + np.einsum("mik,mk,mjk->mij", J, between, J)
+    noise = LedNoise(cov_px2, J, np.abs(dt), parts)
     first = np.searchsorted(node, np.arange(len(nodes.t_s) + 1))[:, None].astype(np.int64)
-    return LedArrays(
+    arrays = LedArrays(
         first=first,
         use=use,
         dt_s=dt,
@@ -271,10 +298,11 @@ def led_arrays(
         t_lin_m=t_lin_m,
         residual_px=pictured.residual_px,
         J=J,
-        cov_px2=cov,
+        cov_px2=noise.covariance_px2(levels),
         nis=np.zeros(len(dt)),
         inflation=np.ones(len(dt)),
     )
+    return arrays, noise
 
 
 def led_chi2(problem: Problem, estimate: Estimate) -> FloatArray:

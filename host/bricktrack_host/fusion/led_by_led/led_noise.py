@@ -6,16 +6,14 @@ residuals, and what of the inertial samples is error from how likely the LEDs ar
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
-from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts
-from bricktrack_host.fusion.smoothing.linearisation import Linearisation
 from bricktrack_host.fusion.smoothing.smoother import Problem, score_noise
 from bricktrack_host.fusion.smoothing.smoother_kernel import NIS_CAP
 
@@ -104,24 +102,21 @@ class InertialNoise:
     def levels(self, stated: tuple[NoiseLevel, NoiseLevel]) -> tuple[NoiseLevel, NoiseLevel]:
         """Return the levels of gyro and accelerometer."""
         gyro, acc = stated
-        return (
-            NoiseLevel(
-                gyro.roughness * _STEP**self.gyro_rough, gyro.systematic * _STEP**self.gyro_systematic
-            ),
-            NoiseLevel(acc.roughness * _STEP**self.acc_rough, acc.systematic * _STEP**self.acc_systematic),
-        )
-
-    def settings(self, stated: FusionSettings) -> FusionSettings:
-        """Return settings with the share of impacts."""
-        share = _STEP**self.impact
+        impact = _STEP**self.impact
         if self.n_impacts:
             # Student's t: what a few pulses were off by tells their spread no better.
             n = max(self.n_impacts, _MIN_IMPACTS)
-            share = share * float(np.sqrt(n / (n - 2)))
-        return replace(
-            stated, gyro_impact_share=stated.gyro_impact_share * share,
-            acc_impact_share=stated.acc_impact_share * share,
-        )  # fmt: skip
+            impact *= float(np.sqrt(n / (n - 2)))
+
+        def moved(level: NoiseLevel, rough: int, systematic: int) -> NoiseLevel:
+            return NoiseLevel(
+                level.roughness * _STEP**rough, level.systematic * _STEP**systematic, level.impact * impact
+            )
+
+        return (
+            moved(gyro, self.gyro_rough, self.gyro_systematic),
+            moved(acc, self.acc_rough, self.acc_systematic),
+        )
 
 
 _KINDS = ("acc_rough", "gyro_rough", "impact", "acc_systematic", "gyro_systematic")
@@ -129,23 +124,17 @@ _KINDS = ("acc_rough", "gyro_rough", "impact", "acc_systematic", "gyro_systemati
 
 def choose_inertial_noise(
     problem: Problem,
-    run: Run,
-    nodes: Nodes,
-    lin: Linearisation,
+    parts: NoiseParts,
+    signal: ImuSignal,
     stated: tuple[NoiseLevel, NoiseLevel],
     settings: FusionSettings,
 ) -> InertialNoise:
     """Return the noise of the inertial samples under which the LEDs of a run are likeliest.
 
-    One kind after the other, down as long as each step earns its price, or else up.
+    One kind after the other, down as long as each step earns its price, or else up. ``parts``: at the steps.
     """
 
-    @cache
-    def parts_of(impact: int) -> NoiseParts:
-        return run.noise_parts(nodes.t_s, lin, InertialNoise(impact=impact).settings(settings))
-
     def score(choice: InertialNoise) -> float:
-        parts = parts_of(choice.impact)
         gyro, acc = choice.levels(stated)
         return _log_likelihood(problem, parts.gyro(gyro), parts.acc(acc)) - _EARN_PER_STEP * choice.n_steps
 
@@ -162,7 +151,7 @@ def choose_inertial_noise(
                 chosen, best = tried, reached
             if chosen is not start:
                 break
-    pulse = run.signal.acc_impact_mps2 > settings.impact_mps2
+    pulse = signal.acc_impact_mps2 > settings.impact_mps2
     n_impacts = int(np.count_nonzero(pulse[1:] & ~pulse[:-1]))
     return replace(chosen, n_impacts=n_impacts if chosen.impact else 0)
 

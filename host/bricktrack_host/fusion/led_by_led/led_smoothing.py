@@ -10,6 +10,7 @@ from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import (
+    LedNoise,
     Pictured,
     SeenLeds,
     led_arrays,
@@ -31,7 +32,7 @@ from bricktrack_host.fusion.led_by_led.standing_errors import (
 )
 from bricktrack_host.fusion.pose_by_pose.fused_output import sample_motion, sample_poses
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run, build_problem, place_nodes
-from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, relinearised
 from bricktrack_host.fusion.smoothing.linearisation import Linearisation
 from bricktrack_host.fusion.smoothing.smoother import POS, Filter, Problem
@@ -227,18 +228,19 @@ class LedSmoother:
 
     def _prepared(self, *, chooses_noise: bool) -> _Ready:
         """Return the problem of the LEDs by what is believed, if asked for with the likeliest noise."""
-        ready = _prepared(self._sights, self._use, self._lin, self._belief)
+        belief = self._belief
+        ready, of_steps, of_leds = _prepared(self._sights, self._use, self._lin, belief)
         if not chooses_noise:
             return ready
-        belief = self._belief
-        noise = choose_inertial_noise(
-            ready.problem, ready.run, ready.nodes, ready.lin, belief.levels, belief.settings
-        )
-        self._belief = replace(
-            belief, levels=noise.levels(belief.levels), settings=noise.settings(belief.settings)
-        )
-        del ready
-        return _prepared(self._sights, self._use, self._lin, self._belief)
+        problem, signal = ready.problem, ready.run.signal
+        if problem.leds is None:
+            raise ValueError("the problem has no LEDs")
+        noise = choose_inertial_noise(problem, of_steps, signal, belief.levels, belief.settings)
+        gyro, acc = levels = noise.levels(belief.levels)
+        self._belief = replace(belief, levels=levels)
+        leds = problem.leds._replace(cov_px2=of_leds.covariance_px2(levels))
+        gyro_var, acc_var = of_steps.gyro(gyro)[:, None], of_steps.acc(acc)[:, None]
+        return replace(ready, problem=replace(problem, gyro_var=gyro_var, acc_var=acc_var, leds=leds))
 
     def _pass(self, ready: _Ready) -> _Pass:
         """Smooth once."""
@@ -264,23 +266,25 @@ def _origin_m(s: Smoothed) -> FloatArray:
     return np.asarray(state.x[:, s.b, POS] - state.R[:, s.b] @ s.run.lever_arm_m)
 
 
-def _prepared(sights: _Sights, use: BoolArray, lin: Linearisation, belief: _Belief) -> _Ready:
-    """Return the problem of sights by what is believed."""
+def _prepared(
+    sights: _Sights, use: BoolArray, lin: Linearisation, belief: _Belief
+) -> tuple[_Ready, NoiseParts, LedNoise]:
+    """Return the problem of sights by what is believed, and the noise of its steps and LEDs."""
     settings, leds, pictured = belief.settings, sights.leds, sights.pictured
     off_px = belief.errors.in_picture_px(leds, pictured)
     pictured = replace(pictured, residual_px=pictured.residual_px - off_px)
     use = use & pictured.is_facing
     run = _without_frames(belief.run.with_acc_loss(lin.loss_s2))
     nodes = Nodes(place_nodes(belief.run, lin).t_s, np.zeros(0, dtype=np.int64))
-    problem, _ = build_problem(
+    problem, (of_steps,) = build_problem(
         [run], [nodes], [lin], settings=settings, use_frame=[np.zeros(0, dtype=np.bool_)],
         noise_scale=[np.ones(2)], levels=[belief.levels],
     )  # fmt: skip
-    arrays = led_arrays(
+    arrays, of_leds = led_arrays(
         leds, pictured, run, nodes, lin, belief.levels,
         cov_px2=believed_covariance_px2(leds, sights.still, belief.scales), use=use, settings=settings,
     )  # fmt: skip
-    return _Ready(pictured, use, run, nodes, lin, replace(problem, leds=arrays))
+    return _Ready(pictured, use, run, nodes, lin, replace(problem, leds=arrays)), of_steps, of_leds
 
 
 def _placeable(leds: SeenLeds, s: Smoothed, settings: FusionSettings) -> SeenLeds:

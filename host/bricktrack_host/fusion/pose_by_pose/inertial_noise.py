@@ -22,13 +22,15 @@ class NoiseParts:
     Attributes
     ----------
     gyro_fixed, acc_fixed
-        White noise of the samples, impacts, clipping, a sample bridged, and gaps: what their fill is off by,
-        or without one the whole spread of the signal.
+        White noise of the samples, clipping, a sample bridged, and gaps: what their fill is off by, or
+        without one the whole spread of the signal.
     gyro_rough, acc_rough
         Steady roughness beyond the sensor's own noise, at a share of 1.
     gyro_systematic, acc_systematic
         Scale and lever-arm errors in proportion to the motion, which keep their sign for a while; those of a
         vibration do not, and are left out.
+    gyro_impact, acc_impact
+        Pulses, at the share that is stated.
     """
 
     gyro_fixed: FloatArray
@@ -37,6 +39,8 @@ class NoiseParts:
     acc_fixed: FloatArray
     acc_rough: FloatArray
     acc_systematic: FloatArray
+    gyro_impact: FloatArray
+    acc_impact: FloatArray
 
     def __add__(self, other: "NoiseParts") -> "NoiseParts":
         """Return the densities of two sensors together."""
@@ -48,21 +52,26 @@ class NoiseParts:
             self.gyro_fixed
             + level.roughness**2 * self.gyro_rough
             + level.systematic**2 * self.gyro_systematic
+            + level.impact**2 * self.gyro_impact
         )
 
     def acc(self, level: "NoiseLevel") -> FloatArray:
         """Return the whole density for one level."""
         return np.asarray(
-            self.acc_fixed + level.roughness**2 * self.acc_rough + level.systematic**2 * self.acc_systematic
+            self.acc_fixed
+            + level.roughness**2 * self.acc_rough
+            + level.systematic**2 * self.acc_systematic
+            + level.impact**2 * self.acc_impact
         )
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseLevel:
-    """How much of the roughness, and how many times the stated systematic error, is believed to be error."""
+    """How much of the roughness, and how many times the stated error of the rest, is believed to be error."""
 
     roughness: float
     systematic: float
+    impact: float = 1.0
 
 
 def noise_parts(
@@ -83,9 +92,10 @@ def noise_parts(
 
     gap = hold * (signal.in_gap(points, least_periods=_ONE_MISSING) & ~filled).mean(axis=1)
     bridged = period * (signal.in_gap(points) & ~filled).mean(axis=1)
-    gyro_fixed = s.gyro_noise_radps**2 + (s.gyro_impact_share * signal.gyro_impact_radps) ** 2
-    shove = np.maximum(signal.acc_impact_mps2, s.impact_arm_mm * 1e-3 / period * signal.gyro_impact_radps)
-    acc_fixed = s.acc_noise_mps2**2 + (s.acc_impact_share * shove) ** 2 + signal.clip_sd_mps2**2
+    gyro_impact, acc_impact = signal.gyro_impact_radps, signal.acc_impact_mps2
+    shove = np.maximum(acc_impact, s.impact_arm_mm * 1e-3 / period * gyro_impact)
+    gyro_fixed = np.full(len(size), s.gyro_noise_radps**2)
+    acc_fixed = s.acc_noise_mps2**2 + signal.clip_sd_mps2**2
     t_sd_s = signal.samples.t_sd_s
     if t_sd_s is not None:  # a sample that may belong to another slot
         gyro_fixed = gyro_fixed + (_steepness(signal.gyro_radps, signal.t_s) * t_sd_s) ** 2
@@ -93,26 +103,32 @@ def noise_parts(
     gyro_rough = np.maximum(signal.gyro_roughness_radps**2 - s.gyro_noise_radps**2, 0.0)
     acc_rough = np.maximum(signal.acc_roughness_mps2**2 - s.acc_noise_mps2**2, 0.0)
     acc_systematic = (s.acc_scale_sd * moving) ** 2 + (arm_m * (turn + size**2)) ** 2
-    of_gyro = gyro_fixed * period, gyro_rough * period, (s.gyro_scale_sd * size) ** 2 * hold
-    of_acc = acc_fixed * period, acc_rough * period, acc_systematic * hold
+    gyro_parts = (
+        gyro_fixed * period, gyro_rough * period, (s.gyro_scale_sd * size) ** 2 * hold,
+        (s.gyro_impact_share * gyro_impact) ** 2 * period, signal.gyro_bridge_radps,
+    )  # fmt: skip
+    acc_parts = (
+        acc_fixed * period, acc_rough * period, acc_systematic * hold,
+        (s.acc_impact_share * shove) ** 2 * period, signal.acc_bridge_mps2,
+    )  # fmt: skip
     # Over a step, but for what of it is filled: there no sample tells.
-    gyro = step_means(signal.t_s, np.stack([*of_gyro, signal.gyro_bridge_radps], axis=1), points, ~filled)
-    acc = step_means(
-        signal.t_s, np.stack([*of_acc, signal.acc_bridge_mps2], axis=1), points + lin.lag_s, ~filled
-    )
+    gyro = step_means(signal.t_s, np.stack(gyro_parts, axis=1), points, ~filled)
+    acc = step_means(signal.t_s, np.stack(acc_parts, axis=1), points + lin.lag_s, ~filled)
     return NoiseParts(
         gyro_fixed=gyro[:, 0]
-        + bridged * gyro[:, 3] ** 2
+        + bridged * gyro[:, 4] ** 2
         + gap * (float(np.sqrt(np.mean(size**2))) + 0.05) ** 2
         + filled.mean(axis=1) * fill_gyro,
         gyro_rough=gyro[:, 1],
         gyro_systematic=gyro[:, 2],
         acc_fixed=acc[:, 0]
-        + bridged * acc[:, 3] ** 2
+        + bridged * acc[:, 4] ** 2
         + gap * (float(np.sqrt(np.mean(moving**2))) + 0.5) ** 2
         + filled.mean(axis=1) * fill_acc,
         acc_rough=acc[:, 1],
         acc_systematic=acc[:, 2],
+        gyro_impact=gyro[:, 3],
+        acc_impact=acc[:, 3],
     )
 
 
