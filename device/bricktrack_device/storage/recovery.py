@@ -3,6 +3,7 @@
 Nothing goes: what cannot be read is kept under another name.
 """
 
+import errno
 import logging
 import re
 import shutil
@@ -35,6 +36,7 @@ from bricktrack_common.run_manifest import (
     read_manifest,
 )
 from bricktrack_common.typed_data import dump_json
+from bricktrack_device.storage.disk import storage_error
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME, PARTIAL_SUFFIX
 
@@ -42,6 +44,7 @@ logger = logging.getLogger(__name__)
 
 DAMAGED_SUFFIX = ".damaged"
 _CUT_OFF = "no whole manifest was on the card: saving was cut off, or the card lost it; what is there is here"
+_NOT_THE_CARD = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EINTR, errno.EACCES, errno.EPERM}
 
 T = TypeVar("T")
 
@@ -150,6 +153,9 @@ def _reopen_if_damaged(folder: Path, store: RunStore) -> None:
 def describe_anew_if_altered(store: RunStore, run_id: str) -> list[str]:
     """Compare a run's files with the manifest; where the card altered or lost one, describe them as they are.
 
+    The new manifest takes the place of the old one, kept as ``manifest.json.damaged``, in one step: the run
+    is on offer throughout.
+
     Returns
     -------
     altered : list of str
@@ -159,22 +165,35 @@ def describe_anew_if_altered(store: RunStore, run_id: str) -> list[str]:
     ------
     RunFormatError
         If the manifest cannot be read.
-    OSError
-        If the card fails.
+    StorageError
+        If the card is full or fails; what the manifest said still holds.
     """
     folder = store.runs / run_id
     path = folder / MANIFEST_NAME
-    altered = [f.name for f in read_manifest(path).files if _entry(folder / f.name) != f]
-    if altered:
-        logger.warning("%s: altered on the card since it was saved: %s", run_id, ", ".join(altered))
-        store.forget(run_id)
-        store.disk.rename(path, path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX))
-        unfinished = store.runs / (run_id + PARTIAL_SUFFIX)
-        store.disk.rename(folder, unfinished)
-        words = [
-            f"{name}: the card altered it after it was saved; what is left is as found" for name in altered
-        ]
-        _finish(unfinished, run_id, store, words)
+    before = read_manifest(path)
+    is_doubted = bool(_differing(before, folder))
+    try:
+        altered = [MANIFEST_NAME] if is_doubted else []
+        altered += [f.name for f in before.files if _entry(folder / f.name) != f]
+        if altered:
+            logger.warning("%s: altered on the card since it was saved: %s", run_id, ", ".join(altered))
+            contents = path.read_bytes()
+            aside = path.with_name(MANIFEST_NAME + DAMAGED_SUFFIX)
+            store.disk.write_file(aside, lambda f: f.write(contents))
+            words = [
+                f"{name}: the card altered it after it was saved; what is left is as found"
+                for name in altered
+            ]
+            anew = rebuild_manifest(folder, run_id, store.unit, None if is_doubted else before)
+            anew = _with_files(anew, folder, words)
+            temporary = path.with_name(f".{MANIFEST_NAME}")  # no name of a run's file
+            store.disk.write_file(temporary, lambda f: f.write(dump_json(anew)))
+            try:
+                store.disk.rename(temporary, path)
+            finally:
+                store.forget(run_id)
+    except OSError as e:
+        raise storage_error(f"{folder}: cannot be compared with its manifest", e) from e
     return altered
 
 
@@ -201,29 +220,40 @@ def _why(folder: Path) -> str:
     )
 
 
-def _finish(folder: Path, run_id: str, store: RunStore, why: Sequence[str] = ()) -> None:
-    """Give a folder its final name, with a manifest made anew where its own is not whole, and say why."""
+def _finish(folder: Path, run_id: str, store: RunStore) -> None:
+    """Give a folder its final name, with a manifest made anew where its own is not whole."""
     if not _is_whole(folder):
-        manifest = rebuild_manifest(folder, run_id, store.unit)
-        found = {p.name: _entry(p) for p in sorted(folder.iterdir()) if _is_run_file(p)}
-        unreadable = [
-            f"{name} is on the card and cannot be read" for name, entry in found.items() if not entry
-        ]
-        manifest = msgspec.structs.replace(
-            manifest,
-            missing=[*manifest.missing, *(why or [_why(folder)]), *unreadable],
-            files=[entry for entry in found.values() if entry],
-        )
+        manifest = _with_files(rebuild_manifest(folder, run_id, store.unit), folder, [_why(folder)])
         store.disk.write_file(folder / MANIFEST_NAME, lambda f: f.write(dump_json(manifest)))
         store.disk.sync_folder(folder)
+    store.forget(run_id)
     store.disk.rename(folder, store.runs / run_id)
 
 
+def _with_files(manifest: RunManifest, folder: Path, why: Sequence[str]) -> RunManifest:
+    """Return a manifest made anew with the files that are there, the reasons, and what cannot be read."""
+    found = {p.name: _entry(p) for p in sorted(folder.iterdir()) if _is_run_file(p)}
+    unreadable = [f"{name} is on the card and cannot be read" for name, entry in found.items() if not entry]
+    return msgspec.structs.replace(
+        manifest,
+        missing=[*manifest.missing, *why, *unreadable],
+        files=[entry for entry in found.values() if entry],
+    )
+
+
 def _entry(path: Path) -> FileEntry | None:
-    """Return name, size and hash of a file; `None` of one that the card does not give."""
+    """Return name, size and hash of a file; `None` of one that the card does not give.
+
+    Raises
+    ------
+    OSError
+        If that is not the card's doing: the file may be whole.
+    """
     try:
         return file_entry(path)
     except OSError as e:
+        if e.errno in _NOT_THE_CARD:
+            raise
         logger.warning("%s: %s", path, e.strerror or e)
         return None
 
@@ -242,12 +272,12 @@ def _is_whole(folder: Path) -> bool:
         return False
 
 
-def rebuild_manifest(folder: Path, run_id: str, unit: str) -> RunManifest:
-    """Return a manifest, still without files, over what a partial folder holds.
+def rebuild_manifest(folder: Path, run_id: str, unit: str, before: RunManifest | None = None) -> RunManifest:
+    """Return a manifest, still without files, over what a folder holds.
 
-    The draft that was written first gives camera, clocks and trigger; without it the streams' own headers
-    must do, and the manifest says so. A stream that cannot be read is renamed, so that it stands in nobody's
-    way and is still there.
+    The one ``before``, or else the draft that was written first, gives camera, clocks and trigger; without it
+    the streams' own headers must do, and the manifest says so. A stream that cannot be read is renamed, so
+    that it stands in nobody's way and is still there.
     """
     missing: list[str] = []
     imus: list[ImuDescription] = []
@@ -260,7 +290,7 @@ def rebuild_manifest(folder: Path, run_id: str, unit: str) -> RunManifest:
         t0_ns = int(edges[0][0]) if edges[0].size else None
     frames = _read_or_set_aside(folder / FRAMES_NAME, read_frames, missing)
     try:
-        manifest = read_manifest(folder / DRAFT_NAME)
+        manifest = before or read_manifest(folder / DRAFT_NAME)
     except RunFormatError:
         missing.append("the run's description was lost: camera settings, clocks and window are unknown")
         manifest = RunManifest(
@@ -279,6 +309,8 @@ def _read_or_set_aside(path: Path, read: Callable[[Path], T], missing: list[str]
     try:
         return read(path)
     except RunFormatError as e:
+        if isinstance(e.__cause__, OSError) and e.__cause__.errno in _NOT_THE_CARD:
+            raise e.__cause__ from None
         aside = path.with_name(path.name + DAMAGED_SUFFIX)
         path.rename(aside)
         logger.warning("%s; kept as %s", e, aside.name)

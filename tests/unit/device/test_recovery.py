@@ -2,13 +2,16 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 from saved_runs import BOOT, T0, CutDisk, PowerCut, save_one, store_in
 
+from bricktrack_common.errors import RunFormatError, StorageError
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.run_manifest import FileEntry, RunManifest, file_entry, read_manifest
 from bricktrack_device.storage import recovery
+from bricktrack_device.storage.disk import Disk
 from bricktrack_device.storage.recovery import describe_anew_if_altered, recover_runs
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME
@@ -182,3 +185,88 @@ def test_a_file_that_the_card_does_not_give_is_left_out_and_named(
     assert run.video is None and run.frames is not None and len(run.manifest.files) > 4
     assert "video.h264 is on the card and cannot be read" in run.manifest.missing
     assert (tmp_path / "runs" / run_id / "video.h264").exists()
+
+
+def test_a_run_of_an_earlier_version_keeps_its_description_without_a_draft(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    folder = tmp_path / "runs" / save_one(store)
+    (folder / DRAFT_NAME).unlink()
+    (folder / "edges.msgpack").unlink()
+    before = read_manifest(folder / "manifest.json")
+    assert describe_anew_if_altered(store, folder.name) == ["edges.msgpack"]
+    m = read_manifest(folder / "manifest.json")
+    assert m.camera is not None and (m.camera, m.clocks, m.trigger) == (
+        before.camera,
+        before.clocks,
+        before.trigger,
+    )
+    assert m.window_ns == before.window_ns and m.quality == before.quality
+
+
+def test_a_manifest_altered_while_the_daemon_runs_is_not_offered_as_it_is(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    run_id = save_one(store)
+    path = tmp_path / "runs" / run_id / "manifest.json"
+    store.describe(run_id)
+    path.write_bytes(path.read_bytes().replace(b'"t0_ns": 5000000000', b'"t0_ns": 5000000008', 1))
+    assert describe_anew_if_altered(store, run_id) == ["manifest.json"]
+    m = read_run(path.parent, verify_hashes=True).manifest
+    assert m.state == "interrupted" and m.trigger.t0_ns == T0
+    assert any(words.startswith("manifest.json: the card altered it") for words in m.missing)
+    assert describe_anew_if_altered(store, run_id) == []
+
+
+@pytest.mark.parametrize("cut_at", range(1, 4))
+def test_a_power_cut_while_a_run_is_described_anew_leaves_it_on_offer(tmp_path: Path, cut_at: int) -> None:
+    run_id = save_one(store_in(tmp_path))
+    (tmp_path / "runs" / run_id / "edges.msgpack").unlink()
+    store = RunStore(tmp_path, "unit-1", disk=CutDisk(cut_at), boot_id=BOOT)
+    with pytest.raises(PowerCut):
+        describe_anew_if_altered(store, run_id)
+    store = store_in(tmp_path)
+    assert recover_runs(store) == [] and [r.run_id for r in store.list_runs()] == [run_id]
+    describe_anew_if_altered(store, run_id)
+    assert read_run(tmp_path / "runs" / run_id, verify_hashes=True).video is not None
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+def test_a_card_that_takes_nothing_keeps_an_altered_run_on_offer(tmp_path: Path, code: int) -> None:
+    class Failing(Disk):
+        def write_file(self, path: Path, fill: Callable[[BinaryIO], object]) -> None:
+            raise OSError(code, os.strerror(code))
+
+    run_id = save_one(store_in(tmp_path))
+    (tmp_path / "runs" / run_id / "edges.msgpack").unlink()
+    store = RunStore(tmp_path, "unit-1", disk=Failing(), boot_id=BOOT)
+    before = store.describe(run_id)
+    with pytest.raises(StorageError, match=f"{run_id}.*{os.strerror(code)}"):
+        describe_anew_if_altered(store, run_id)
+    store.forget(run_id)
+    assert store.describe(run_id) == before
+
+
+@pytest.mark.parametrize("reader", ["file_entry", "read_imu"])
+def test_a_file_that_the_daemon_cannot_open_for_want_of_descriptors_is_not_called_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str
+) -> None:
+    store = store_in(tmp_path)
+    run_id = save_one(store)
+    folder = tmp_path / "runs" / run_id
+    (folder / "edges.msgpack").unlink()
+    before = read_manifest(folder / "manifest.json")
+    really = getattr(recovery, reader)
+
+    def opened(path: Path) -> object:
+        if path.name == "imu_brick.msgpack":
+            try:
+                raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+            except OSError as e:
+                if reader == "file_entry":
+                    raise
+                raise RunFormatError(f"{path}: {e.strerror}") from e
+        return really(path)
+
+    monkeypatch.setattr(recovery, reader, opened)
+    with pytest.raises(StorageError, match="Too many open files"):
+        describe_anew_if_altered(store, run_id)
+    assert read_manifest(folder / "manifest.json") == before and (folder / "imu_brick.msgpack").exists()
