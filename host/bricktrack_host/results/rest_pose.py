@@ -1,6 +1,8 @@
 """The rest pose: where the brick stood while nothing moved, from which displacements are counted (tare)."""
 
+from bisect import insort
 from dataclasses import dataclass
+from math import dist
 from typing import Literal
 
 import numpy as np
@@ -187,22 +189,30 @@ def _first_still_frames(optical: OpticalTrack, valid: BoolArray) -> IntArray:
     still = (step_mm < limit_mm) & (step_rad < limit_rad)
     edges = np.diff(np.concatenate([[0], still.astype(np.int8), [0]]))
     for start, stop in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        n = stop - start + 1
-        if n < MIN_FRAMES:
+        run = slice(start, stop + 1)
+        if stop + 1 - start < MIN_FRAMES:
             continue
         # A slow start drifts off in small steps: end where the pose leaves the median of what came before.
-        run = np.arange(start, stop + 1)
-        keep = MIN_FRAMES
-        while keep < n:
-            head, i = run[:keep], run[keep]
-            off_mm = np.linalg.norm(t_mm[i] - np.median(t_mm[head], axis=0))
-            turns = rvec_from_matrix(R[head[0]].T @ R[run[: keep + 1]])
-            off_rad = np.linalg.norm(turns[-1] - np.median(turns[:-1], axis=0))
-            if off_mm > max(_STILL_MM, _N_SD * sd_mm[i]) or off_rad > max(_STILL_RAD, _N_SD * sd_rad[i]):
-                break
-            keep += 1
-        return np.asarray(index[run[:keep]])
+        turns_rad = rvec_from_matrix(R[start].T @ R[run])
+        keep = min(
+            _n_near_median(t_mm[run], np.maximum(_STILL_MM, _N_SD * sd_mm[run])),
+            _n_near_median(turns_rad, np.maximum(_STILL_RAD, _N_SD * sd_rad[run])),
+        )
+        return np.asarray(index[run][:keep])
     return np.empty(0, dtype=np.int64)
+
+
+def _n_near_median(vectors: FloatArray, limits: FloatArray) -> int:
+    """Return how many vectors, (n, 3), come before one that is off the median of all before by its limit."""
+    before = [sorted(column) for column in vectors[:MIN_FRAMES].T.tolist()]
+    rows, allowed = vectors.tolist(), limits.tolist()
+    for n in range(MIN_FRAMES, len(rows)):
+        median = [0.5 * (ordered[n // 2] + ordered[(n - 1) // 2]) for ordered in before]
+        if dist(rows[n], median) > allowed[n]:
+            return n
+        for ordered, value in zip(before, rows[n], strict=True):
+            insort(ordered, value)
+    return len(rows)
 
 
 def _inertial_onset_ns(imu: ImuTrack, frames_ns: IntArray) -> int | None:

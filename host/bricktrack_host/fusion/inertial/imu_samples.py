@@ -65,13 +65,12 @@ def roughness(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     # A pulse pulls its neighbours' polynomials as well: only the peak counts.
     peak = off >= 0.9 * maximum_filter1d(off, 9, axis=0, mode="nearest")
     impact = np.where(peak & (off > _IMPACT_SIGMA * usual), off, 0.0).max(axis=1)
-    steady = usual.max(axis=1) / _PREDICTION_GAIN
-    return np.asarray(steady), np.asarray(maximum_filter1d(impact, 3, mode="nearest"))
+    return _steady(usual), np.asarray(maximum_filter1d(impact, 3, mode="nearest"))
 
 
 def is_vibrating(acc_mps2: FloatArray) -> bool:
     """Return whether specific force, shape (n, 3), holds a steady vibration: most of it is rough."""
-    return bool(np.median(roughness(acc_mps2)[0]) > _VIBRATION_MPS2)
+    return bool(np.median(_steady(_usual(_off_neighbours(acc_mps2, 4)))) > _VIBRATION_MPS2)
 
 
 def _off_neighbours(values: FloatArray, n_side: int) -> FloatArray:
@@ -83,6 +82,11 @@ def _off_neighbours(values: FloatArray, n_side: int) -> FloatArray:
 def _usual(off: FloatArray) -> FloatArray:
     """Return the sd by the running median of absolute values."""
     return running_median(off, _STEADY_SAMPLES) / 0.6745
+
+
+def _steady(usual: FloatArray) -> FloatArray:
+    """Return the steady roughness, shape (n,), of what samples usually are off their eight neighbours."""
+    return np.asarray(usual.max(axis=1) / _PREDICTION_GAIN)
 
 
 def _bridge_clipped(t_s: FloatArray, acc: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
