@@ -8,7 +8,9 @@ from brick_shakes import simulate_shake
 
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.fusion.camera_step import words_on_camera_step
-from bricktrack_host.fusion.clocks.time_alignment import align_times
+from bricktrack_host.fusion.clocks import rotation_fit
+from bricktrack_host.fusion.clocks.offset_change import CLOCK_RATE_SD, rotation_fit_of, signal_of
+from bricktrack_host.fusion.clocks.time_alignment import align_times, has_pose
 
 AT = 60
 
@@ -64,3 +66,21 @@ def test_clocks_that_the_motion_does_not_tell_tell_no_knock(shake):
     optical = knocked(shake.optical, [1.2, -1.5, 0.6])
     alignment = replace(align_times(optical, shake.imu), source="stamps")
     assert words_on_camera_step(optical, shake.imu, alignment) == []
+
+
+def test_a_step_is_sought_in_stretches_as_in_the_whole_run(monkeypatch):
+    shake = simulate_shake(5, duration_s=30.0)
+    R = shake.optical.R_camera_brick.copy()
+    R[500:] = matrix_from_rvec(np.deg2rad([1.2, -1.5, 0.6])) @ R[500:]
+    optical = replace(shake.optical, R_camera_brick=R)
+    alignment = align_times(optical, shake.imu)
+    signal = signal_of(shake.imu, alignment)
+    fit, _ = rotation_fit_of(optical, alignment, signal, has_pose(optical), CLOCK_RATE_SD)
+    step = fit.attitude_step(alignment.gyro_bias_radps)
+    monkeypatch.setattr(rotation_fit, "_STEPS_AT_ONCE", 10_000)
+    monkeypatch.setattr(rotation_fit, "_STEP_KNOTS", 10_000)
+    whole = fit.attitude_step(alignment.gyro_bias_radps)
+    assert step.frame == whole.frame == 500
+    assert step.rvec_rad == pytest.approx(whole.rvec_rad, rel=1e-6)
+    assert step.covariance == pytest.approx(whole.covariance, rel=1e-6, abs=1e-12)
+    assert step.gain == pytest.approx(whole.gain, rel=1e-6)

@@ -29,6 +29,8 @@ _ROBUST_ROUNDS = 4
 _MISFIT_CAP = 25.0
 _BESIDE_STEP = 4  # frames on either side that a step needs
 _STEP_TIME_SD_S = 0.02
+_STEPS_AT_ONCE = 256
+_STEP_KNOTS = 20  # of the drift, 10 s: of what a step does beyond them 1e-11 is left
 LOSS_PRIOR_SD_S2 = 2e-5  # of c: 4.5 ms squared, the BNO055's narrower settings
 DISPERSION_PRIOR_SD_S3 = 5e-8
 """Of d: a second-order low-pass of 7 ms mean delay has 3e-8 (critically damped) to -6e-8 (Butterworth)."""
@@ -171,6 +173,14 @@ class _LinearFit:
     def drift(self, weight: FloatArray, values: FloatArray) -> FloatArray:
         """Return the slow drift in values, (n, c)."""
         return np.asarray(drift_of(weight, *self.hats, np.ascontiguousarray(values)))
+
+    def near(self, frames: IntArray) -> tuple[slice, tuple[IntArray, FloatArray, int]]:
+        """Return the rows that a step at one of some frames, rising, moves against the drift; their hats."""
+        knot, share, _ = self.hats
+        ends = knot[frames[[0, -1]]] + np.array([-_STEP_KNOTS, _STEP_KNOTS + 1])
+        rows = slice(*np.searchsorted(knot, ends).tolist())
+        near = knot[rows] - knot[rows.start]
+        return rows, (near, share[rows], int(near[-1]) + 2)
 
     def fit(self) -> _Fitted:
         """Return the fit by weights that outliers lose."""
@@ -330,19 +340,26 @@ class RotationFit:
         if linear is None:
             return None
         fit, n = linear.fit(), len(linear.error)
-        since = np.tri(n)[:, _BESIDE_STEP : n - _BESIDE_STEP + 1]  # column k: one from a frame on
-        white = (since - linear.drift(fit.weight, since)) * (fit.weight / fit.scale)[:, None]
-        A = fit.white[:, :, :-1] * (fit.weight / fit.scale)[:, None, None]
-        left = fit.white[:, :, -1] * (fit.weight / fit.scale)[:, None] - A @ fit.found
-        beside = np.einsum("nk,nip->kip", white, A, optimize=True)
-        normal = np.einsum("nk,nk->k", white, white)[:, None, None] * np.eye(3)
-        normal -= beside @ fit.covariance @ np.swapaxes(beside, 1, 2)
-        pull = white.T @ left
-        size = np.linalg.solve(normal + 1e-9 * np.eye(3), pull[..., None])[..., 0]
-        gain = np.einsum("ki,ki->k", pull, size)
-        best = int(np.argmax(gain))
-        frame = int(np.flatnonzero(linear.inside)[best + _BESIDE_STEP])
-        return AttitudeStep(frame, size[best], np.linalg.inv(normal[best]), float(gain[best]))
+        weight = fit.weight / fit.scale
+        A = fit.white[:, :, :-1] * weight[:, None, None]
+        left = fit.white[:, :, -1] * weight[:, None] - A @ fit.found
+        stop, found = n - _BESIDE_STEP + 1, []
+        for first in range(_BESIDE_STEP, stop, _STEPS_AT_ONCE):
+            steps = np.arange(first, min(first + _STEPS_AT_ONCE, stop))
+            rows, hats = linear.near(steps)
+            since = np.greater_equal.outer(np.arange(n)[rows], steps).astype(np.float64)
+            white = (since - drift_of(fit.weight[rows], *hats, since)) * weight[rows, None]
+            beside = np.einsum("nk,nip->kip", white, A[rows], optimize=True)
+            # The least is for steps that the drift takes up, as it does between stretches with samples.
+            normal = (np.einsum("nk,nk->k", white, white)[:, None, None] + 1e-9) * np.eye(3)
+            normal -= beside @ fit.covariance @ np.swapaxes(beside, 1, 2)
+            pull = white.T @ left[rows]
+            size = np.linalg.solve(normal, pull[..., None])[..., 0]
+            gain = np.einsum("ki,ki->k", pull, size)
+            best = int(np.argmax(gain))
+            frame = int(np.flatnonzero(linear.inside)[steps[best]])
+            found.append(AttitudeStep(frame, size[best], np.linalg.inv(normal[best]), float(gain[best])))
+        return max(found, key=lambda step: step.gain)
 
     def _linear(
         self, basis: FloatArray, prior_sd_s: FloatArray, gyro_bias_radps: FloatArray
