@@ -145,7 +145,7 @@ def draw_state_errors(
     if doubt is not None:
         standing = rng.standard_normal((len(doubt.root), n_draws))
         for nodes, moved in doubt.stretches(estimate.state, b):
-            drawn[nodes] += (moved @ standing)[: n_steps + 1 - nodes.start]
+            drawn[nodes] += (moved @ standing)[: len(drawn[nodes])]
     return drawn
 
 

@@ -100,6 +100,21 @@ def test_a_standing_error_is_one_over_the_whole_run(smoothed):
     assert np.abs(np.abs(unit) - np.abs(unit[0])).max() < 0.05
 
 
+def test_errors_of_a_run_beside_a_much_longer_one_are_drawn_to_its_end():
+    runs = []
+    for duration_s in (0.9, 4.0):
+        s = simulate_shake(3, duration_s=duration_s)
+        item = FusionInput(s.optical, s.imu, LEVER_ARM_MM, s.optical.t_ns)
+        runs.append(prepare_run(item, FusionSettings()))
+    s = smooth_poses(runs, FusionSettings())[0]
+    assert s.doubt is not None
+    rng = np.random.default_rng(4)
+    drawn = draw_state_errors(s.problem, s.passed, s.estimate, s.b, doubt=s.doubt, n_draws=N_DRAWS, rng=rng)
+    assert len(drawn) == np.count_nonzero(s.problem.dt_s[:, s.b] > 0) + 1
+    sd = np.sqrt(np.diagonal(s.estimate.covariance[: len(drawn), s.b], axis1=1, axis2=2))
+    assert drawn.std(axis=2) == pytest.approx(sd, rel=0.08)  # as above
+
+
 def correlated_squares(rng, n, n_runs, gain, memory):
     """Return the squares of six errors that remember, ``gain`` times what is stated, shape (n, n_runs)."""
     noise = rng.normal(0, 1, (n + 200, 6, n_runs))
