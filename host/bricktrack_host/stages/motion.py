@@ -24,6 +24,7 @@ from bricktrack_host.results.ray_errors import RayErrors
 from bricktrack_host.results.result_tables import FusedKind
 from bricktrack_host.stages.clocks import Inertial
 from bricktrack_host.tracking.optical_track import solve_poses
+from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.first_poses import FirstPoses
 from bricktrack_host.tracking.pose.frame_motion import led_motion, motion_to_leds, within_exposure_ns
 from bricktrack_host.tracking.pose.refine import LedMotion
@@ -162,10 +163,12 @@ def with_times_doubted(observations: LedObservations, time_sd_ns: FloatArray) ->
         As `unsure_stamps` returns it.
     """
     uv, t_s = observations.uv_px, observations.sensor_timestamp_ns * 1e-9
-    if len(uv) < 3 or not time_sd_ns.any():
+    if not time_sd_ns.any():
         return observations
-    speed = np.zeros_like(uv)  # px/s, by the frames on either side
-    speed[1:-1] = np.nan_to_num((uv[2:] - uv[:-2]) / (t_s[2:] - t_s[:-2])[:, None, None])
+    speed = np.zeros_like(uv)  # px/s, by the frames on either side that show it, or the one that does
+    for led, is_seen in enumerate(all_finite(uv).T):
+        if is_seen.sum() > 1:
+            speed[is_seen, led] = np.gradient(uv[is_seen, led], t_s[is_seen], axis=0)
     doubt_px = speed * (time_sd_ns * 1e-9)[:, None, None]
     n_seen = np.isfinite(uv[..., 0]).sum(axis=1)[:, None, None, None]
     doubt_px2 = n_seen * doubt_px[..., :, None] * doubt_px[..., None, :]
