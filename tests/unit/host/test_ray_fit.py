@@ -64,12 +64,12 @@ def test_the_default_choice_is_as_good():
     assert fitted.doubts == ()
 
 
-@pytest.mark.slow
 @cache
 def fitted(lens, seed):
     return fit_central_rays(two_planes(lens, seed), sensor_mode=IMX219_1080P)
 
 
+@pytest.mark.slow
 def test_the_stated_uncertainty_covers_the_truth():
     """Over 24 boards; 50 of each lens, in scripts/bench_ray_models.py, give 93.8 to 94.8 %.
 
