@@ -55,7 +55,8 @@ class TightResult:
     centroid_noise_scale : float
         What the stated sd of the centroids had to be multiplied by.
     led_offset_sd_px : float
-        How far single LEDs lie beside where layout and profile have them, all over the run.
+        How far single LEDs lie beside where layout and profile have them, all over the run; NaN where fewer
+        than four are seen at once, which does not tell.
     """
 
     fused: FusionResult

@@ -260,7 +260,7 @@ def words_on_rejected(is_rejected: BoolArray, is_fused: BoolArray) -> list[str]:
 
 def words_on_led_offsets(sd_px: float) -> list[str]:
     """Return what to say of LEDs that lie beside their places throughout; a few hundredths are usual."""
-    if sd_px <= _MUCH_OFFSET_PX:
+    if not sd_px > _MUCH_OFFSET_PX:
         return []
     return [
         f"single LEDs lie some {sd_px:.2f} px (sd) beside where layout and profile have them, all over the "

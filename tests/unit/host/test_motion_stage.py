@@ -54,7 +54,7 @@ def test_a_centroid_left_out_now_and_then_is_no_point_to_read():
 
 
 def test_leds_beside_their_places_are_told_beyond_what_is_usual():
-    assert words_on_led_offsets(0.05) == []
+    assert words_on_led_offsets(0.05) == words_on_led_offsets(np.nan) == []
     assert "0.26 px" in words_on_led_offsets(0.264)[0]
 
 

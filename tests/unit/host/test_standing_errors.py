@@ -118,6 +118,17 @@ def test_what_acceleration_draws_centroids_by_is_not_told_but_makes_all_unsure(p
     assert np.max(np.abs(wrong[:21]) * 0.4 / scale[:21]) > 0.05  # the accelerometer's scale, for one
 
 
+def test_three_leds_at_once_do_not_tell_how_far_single_ones_are_off(plain):
+    done, last = plain
+    problem, leds, n_views = last.states.problem, done.leds, done.errors.n_views
+    few = replace(problem, leds=problem.leds._replace(use=problem.leds.use & (leds.led < 3)))
+    way = StandingWay(few, Filter(few), leds, last.pictured, 7, n_views=n_views)
+    prior = StandingPrior.of(leds, last.pictured, 7, SETTINGS, n_views=n_views, camera_moves=False)
+    found = way.estimate(prior, np.zeros_like(done.errors.value))
+    assert np.isnan(found.offset_sd_px)
+    assert np.isfinite(found.value).all() and np.isfinite(found.covariance).all()
+
+
 def test_how_far_a_smear_draws_leaning_lights_is_found(plain):
     # Centroids drawn by a fiftieth of their smear times how far their axes lean, as the last pass pictures it.
     done, last = plain

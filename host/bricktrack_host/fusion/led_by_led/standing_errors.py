@@ -76,7 +76,7 @@ class StandingErrors:
         As estimated.
     covariance : ndarray, shape (q, q)
     offset_sd_px : float
-        Of the errors of single LEDs, as they show among themselves.
+        Of the errors of single LEDs, as they show among themselves; NaN where too few are seen at once.
     n_leds, n_views : int
     """
 
@@ -251,7 +251,8 @@ class StandingWay:
         # What is not estimated draws the others after it.
         drawn = np.eye(len(known))[_SPREAD] - covariance @ normal[:, _SPREAD]
         covariance += _SPREAD_SD**2 * np.outer(drawn, drawn)
-        return StandingErrors(value, 0.5 * (covariance + covariance.T), offset_sd_px, n_leds, prior.n_views)
+        told_px = offset_sd_px if len(self._among_themselves.value) else float("nan")
+        return StandingErrors(value, 0.5 * (covariance + covariance.T), told_px, n_leds, prior.n_views)
 
     def doubt(self, errors: StandingErrors, of: IntArray) -> Doubt:
         """Return what the errors leave unsure of smoothed states ``of``, shape (c,)."""
