@@ -49,7 +49,7 @@ class ImuFlag(IntFlag):
     REPEAT = 4
     """All channels equal the sample before: the sensor had nothing new (its clock beats with ours)."""
     STUCK = 8
-    """Equal for at least ten slots: the sensor no longer measures. Values are NaN."""
+    """Ten samples or more are equal, with or without gaps: the sensor no longer measures. Values are NaN."""
     BLANK = 16
     """All registers 0x00 or 0xFF: a sensor in reset or off the bus. Values are NaN."""
     ACC_CLIPPED = 32
@@ -223,10 +223,12 @@ def decode_imu(description: ImuDescription, records: list[ImuRecord]) -> ImuSamp
 
     flags[present & ((raw[:, :18] == 0).all(axis=1) | (raw == 0xFF).all(axis=1))] |= int(ImuFlag.BLANK)
     # Temperature and calibration status change on their own time: repeats are judged on the measurements.
-    same = np.zeros(n, dtype=np.bool_)
-    same[1:] = present[1:] & present[:-1] & (raw[1:, :44] == raw[:-1, :44]).all(axis=1)
-    flags[same] |= int(ImuFlag.REPEAT)
-    flags[_in_runs_of_at_least(same, 9)] |= int(ImuFlag.STUCK)
+    # A gap between two makes the later one no newer.
+    taken = np.flatnonzero(present)
+    same = np.zeros(len(taken), dtype=np.bool_)
+    same[1:] = (raw[taken[1:], :44] == raw[taken[:-1], :44]).all(axis=1)
+    flags[taken[same]] |= int(ImuFlag.REPEAT)
+    flags[taken[_in_runs_of_at_least(same, 9)]] |= int(ImuFlag.STUCK)
     limit = description.acc_range_g * STANDARD_GRAVITY_MPS2 * 0.995
     flags[present & (np.abs(acc) >= limit).any(axis=1)] |= int(ImuFlag.ACC_CLIPPED)
     flags[present & (np.abs(gyro_dps) >= description.gyro_range_dps * 0.998).any(axis=1)] |= int(

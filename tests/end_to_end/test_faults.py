@@ -142,8 +142,13 @@ def test_a_silent_reset_is_told_and_nothing_after_it_is_believed(tmp_path: Path)
     after, before = samples.t_ns > t0 + 510_000_000, samples.t_ns < t0 + 490_000_000
     assert np.isnan(samples.acc_mps2[after]).all()
     assert (samples.flags[after] & (ImuFlag.BLANK | ImuFlag.MODE_CHANGED | ImuFlag.GAP) != 0).all()
-    assert np.isfinite(samples.acc_mps2[before]).all(axis=1).mean() > 0.8
-    assert run.manifest.quality.imu_unusable > 50
+    # Slots that a busy machine skipped are gaps, on both sides; what was read is right before, and nothing after.
+    taken = samples.flags & ImuFlag.GAP == 0
+    assert (taken & before).sum() > 10 and np.isfinite(samples.acc_mps2[taken & before]).all(
+        axis=1
+    ).mean() > 0.8
+    n_after = (taken & after).sum()
+    assert n_after > 10 and run.manifest.quality.imu_unusable >= n_after
 
 
 def test_a_stuck_sensor_is_told_and_its_unique_rate_falls(tmp_path: Path) -> None:
@@ -153,12 +158,15 @@ def test_a_stuck_sensor_is_told_and_its_unique_rate_falls(tmp_path: Path) -> Non
     assert t0 is not None
     after = samples.t_ns > t0 + 430_000_000
     present = samples.flags & ImuFlag.GAP == 0
-    assert (samples.flags[after & present] & ImuFlag.STUCK != 0).all() and np.isnan(
-        samples.gyro_radps[after]
-    ).all()
-    # 0.6 s of 1.3 s measured something new.
-    assert 25 < run.manifest.quality.imu_unique_hz["brick"] < 50
-    assert run.manifest.quality.imu_repeats > 50
+    held = after & present
+    assert held.sum() >= 15 and np.isnan(samples.gyro_radps[after]).all()
+    assert (samples.flags[held] & ImuFlag.STUCK != 0).all()
+    # 0.6 s of 1.3 s measured something new, but for the slots that a busy machine skipped.
+    taken = present & (samples.t_ns < t0 + 400_000_000)
+    fresh = present & (samples.flags & (ImuFlag.REPEAT | ImuFlag.STUCK) == 0)
+    assert taken.sum() > 15 and fresh[taken].mean() > 0.9
+    assert run.manifest.quality.imu_unique_hz["brick"] == pytest.approx(fresh.sum() / 1.3, abs=1.0)
+    assert run.manifest.quality.imu_repeats >= held.sum()
 
 
 def test_an_absent_sensor_is_told_when_arming_and_the_rest_is_recorded(tmp_path: Path) -> None:
@@ -190,8 +198,8 @@ def test_two_sensors_on_two_buses_make_two_streams_and_keep_their_calibrations(t
     assert (fused.acc_range_g, fused.fusion, fused.axis_map) == (4.0, True, "P1")
     assert raw.chip_id != fused.chip_id
     assert np.isnan(raw_samples.q_wxyz).all()
-    norm = np.linalg.norm(fused_samples.q_wxyz, axis=1)
-    assert np.nanmax(np.abs(norm - 1)) < 1e-3 and np.isfinite(norm).mean() > 0.8
+    norm = np.linalg.norm(fused_samples.q_wxyz[fused_samples.flags & ImuFlag.GAP == 0], axis=1)
+    assert norm.size > 40 and np.nanmax(np.abs(norm - 1)) < 1e-3 and np.isfinite(norm).mean() > 0.8
     # Both rest on the same brick before the shake: P5 only turns what the first one says. Data sheet, table
     # 3-4: AXIS_MAP_CONFIG 0x21 makes x the chip's y and y its x, AXIS_MAP_SIGN 0x01 turns z over.
     t0 = first.manifest.trigger.t0_ns

@@ -31,7 +31,7 @@ class RunLog:
 
 
 _USELESS = {
-    ImuFlag.STUCK: "repeat the one before for ten slots or more: the sensor no longer measured",
+    ImuFlag.STUCK: "repeat the one before, ten in a row or more: the sensor no longer measured",
     ImuFlag.BLANK: "are all zero or all ones: the sensor was in reset or off the bus",
     ImuFlag.MODE_CHANGED: "came in another mode than the one set: the sensor had reset itself",
     ImuFlag.BAD_QUATERNION: "have a quaternion that is none: torn or corrupted reads",

@@ -64,6 +64,19 @@ def test_a_sensor_that_repeats_for_long_is_stuck_and_not_believed():
     assert np.isnan(s.acc_mps2[1:]).all()
 
 
+def test_gaps_between_equal_samples_do_not_make_a_stuck_sensor_believed():
+    # Every other slot is lost, as on a busy processor: by its neighbours alone no sample would be a repeat.
+    s = decode([record(i, burst(i if i < 10 else 10)) for i in range(0, 50, 2)])
+    held = np.arange(12, 49, 2)  # slot 10 is the last one that measured
+    assert (s.flags[held] & (ImuFlag.STUCK | ImuFlag.REPEAT) == ImuFlag.STUCK | ImuFlag.REPEAT).all()
+    assert np.isnan(s.acc_mps2[held]).all() and np.isfinite(s.acc_mps2[:12:2]).all()
+
+
+def test_one_equal_sample_after_a_gap_is_a_repeat():
+    s = decode([record(0, burst(7)), record(1, None, errno=121), record(2, burst(7)), record(3, burst(8))])
+    assert s.flags.tolist() == [0, int(ImuFlag.GAP), int(ImuFlag.REPEAT), 0]
+
+
 @pytest.mark.parametrize("byte", [0x00, 0xFF])
 def test_blank_registers_are_not_zero_motion(byte):
     s = decode([record(0, bytes([byte]) * 46)])
