@@ -18,7 +18,7 @@ from bricktrack_device.capture.recording import Recording
 from bricktrack_device.capture.room import memory_available_bytes
 from bricktrack_device.capture.saving import build_manifest, streams
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.storage.recovery import recover_runs
+from bricktrack_device.storage.recovery import recover_runs, waiting_copies
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME
 
@@ -78,7 +78,7 @@ class BlackBox:
 
     def bring_in(self, store: RunStore) -> None:
         """Put on the card what a daemon left that was killed; see `storage.recovery`."""
-        if self.folder is not None and self.folder.is_dir() and any(self.folder.iterdir()):
+        if waiting_copies(self.folder):
             recover_runs(store, self.folder)
 
     def begin(self, run_id: str, video_bytes: int) -> None:

@@ -9,6 +9,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 
 from bricktrack_common.clocks import check_monotonic_is_boottime, monotonic_ns, read_clock_triplet
 from bricktrack_common.errors import BricktrackError, StorageError
@@ -30,6 +31,7 @@ from bricktrack_device.capture.run_light import RunLight
 from bricktrack_device.capture.session import Session
 from bricktrack_device.capture.state_table import Cause, StateMachine
 from bricktrack_device.config import DeviceConfig
+from bricktrack_device.in_time import in_time
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.storage.run_store import RunStore
@@ -39,6 +41,7 @@ logger = logging.getLogger(__name__)
 _TICK_S = 0.02
 _IDLE_TICK_S = 0.2
 _RETRY_S = 10.0
+_BRING_IN_TIMEOUT_S = 60.0
 
 
 class _StoppingError(BricktrackError):
@@ -216,7 +219,9 @@ class Recorder:
         try:
             duration_s = duration_s or self._config.recording.duration_s
             check_monotonic_is_boottime(read_clock_triplet())
-            self._black_box.bring_in(self._store)  # where the card was full when the daemon began
+            # Where the card was full when the daemon began; a slow one takes its time.
+            bring_in = partial(self._black_box.bring_in, self._store)
+            in_time("bringing a run in", bring_in, _BRING_IN_TIMEOUT_S, beat=self.beat)
             make_room(self._config, self._store, duration_s)
             check_room(self._config, self._store, duration_s)
             session = Session(

@@ -72,8 +72,7 @@ def recover_runs(store: RunStore, black_box: Path | None = None) -> list[str]:
             _reopen_if_damaged(folder, store)
         except OSError as e:
             logger.warning("%s: cannot be recovered now: %s", folder, e.strerror or e)
-    copies = sorted(black_box.iterdir()) if black_box is not None and black_box.is_dir() else []
-    not_yet = {copy.name for copy in copies if not _bring_in(copy, store)}
+    not_yet = {copy.name for copy in waiting_copies(black_box) if not _bring_in(copy, store)}
     recovered = []
     for folder in sorted(store.runs.glob(f"*{PARTIAL_SUFFIX}")):
         run_id = folder.name.removesuffix(PARTIAL_SUFFIX)
@@ -94,6 +93,17 @@ def recover_runs(store: RunStore, black_box: Path | None = None) -> list[str]:
         else:
             recovered.append(run_id)
     return recovered
+
+
+def waiting_copies(black_box: Path | None) -> list[Path]:
+    """Return what a killed daemon left in memory; nothing, and a word in the log, where it cannot be had."""
+    try:
+        return sorted(black_box.iterdir()) if black_box is not None else []
+    except FileNotFoundError:  # it is made with the first run
+        return []
+    except OSError as e:
+        logger.warning("%s: cannot be listed: %s", black_box, e.strerror or e)
+        return []
 
 
 def _bring_in(copy: Path, store: RunStore) -> bool:

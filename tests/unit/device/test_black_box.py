@@ -1,6 +1,8 @@
 import errno
 import os
 import shutil
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from bricktrack_device.capture.recording import Recording
 from bricktrack_device.capture.ring import VideoCut
 from bricktrack_device.config import DeviceConfig, ImuTable, RecordingTable, StorageTable
 from bricktrack_device.storage.recovery import recover_runs
+from bricktrack_device.storage.run_store import RunStore
 
 
 def cut_after(whole: Recording, n: int) -> Recording:
@@ -121,6 +124,41 @@ def test_arming_first_brings_in_what_is_left_in_memory(bench: MakeBench, tmp_pat
     b = bench(storage=StorageTable(folder=str(tmp_path), margin_mb=1, black_box=str(box)))
     b.arm()
     assert [r.run_id for r in b.store.list_runs()] == ["unit-1_b3f2a7_0001"]
+
+
+def test_a_folder_of_copies_that_cannot_be_listed_stops_neither_start_nor_arming(
+    bench: MakeBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    box = tmp_path / "box"
+    copy_of("unit-1_b3f2a7_0001", box)
+    listed = Path.iterdir
+
+    def of_another_user(path: Path) -> Iterator[Path]:
+        if path == box:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return listed(path)
+
+    monkeypatch.setattr(Path, "iterdir", of_another_user)
+    assert recover_runs(store_in(tmp_path), box) == []
+    bench(storage=StorageTable(folder=str(tmp_path), margin_mb=1, black_box=str(box))).arm()
+    assert f"{box}: cannot be listed: Permission denied" in caplog.text
+
+
+def test_a_slow_card_that_takes_a_copy_in_does_not_starve_the_watchdog(
+    bench: MakeBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = tmp_path / "box"
+    b = bench(storage=StorageTable(folder=str(tmp_path), margin_mb=1, black_box=str(box)))
+    ages_s: list[float] = []
+
+    def slowly(black_box: BlackBox, store: RunStore) -> None:
+        for _ in range(10):
+            time.sleep(0.05)
+            ages_s.append(b.recorder.beat_age_s)
+
+    monkeypatch.setattr(BlackBox, "bring_in", slowly)
+    b.arm()
+    assert len(ages_s) == 10 and min(ages_s[5:]) < 0.1  # beaten meanwhile, every 10 ms
 
 
 def test_without_room_in_memory_there_is_no_copy_and_a_word(
