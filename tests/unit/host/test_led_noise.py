@@ -1,19 +1,23 @@
 """How far centroids and samples are believed LED by LED: hand-made sightings and residuals."""
 
 from dataclasses import fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from bricktrack_host.fusion.fusion_settings import FusionSettings
+from bricktrack_host.fusion.led_by_led import led_noise
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_noise import (
     STATED_SCALES,
     InertialNoise,
     believed_covariance_px2,
     centroid_scales,
+    choose_inertial_noise,
     still_sightings,
 )
-from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel
+from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts
 
 
 def sightings(frame, led, u_px):
@@ -92,3 +96,29 @@ def test_an_led_that_nothing_can_be_said_of_does_not_count():
     without = centroid_scales(chi2[100:], still[100:], use[100:], STATED_SCALES)
     chi2[:100] = np.nan
     assert np.array_equal(centroid_scales(chi2, still, use, STATED_SCALES), without)
+
+
+def test_each_kind_of_noise_is_walked_as_long_as_it_pays_and_up_only_where_down_is_unlikelier(monkeypatch):
+    tried = []
+
+    def likelihood(problem, gyro_var, acc_var):
+        # Of steps away from what is stated: acc_rough, gyro_rough, acc_systematic, gyro_systematic, impact.
+        steps = np.log2(np.sqrt([acc_var[0], gyro_var[0], acc_var[1], gyro_var[1], gyro_var[2]]))
+        tried.append(np.round(steps).astype(int).tolist())
+        return -float(np.array([10.0, 1.0, 10.0, 10.0, 0.3]) @ (steps - [-2.0, -0.6, 2.0, 0.0, -3.0]) ** 2)
+
+    monkeypatch.setattr(led_noise, "_log_likelihood", likelihood)
+    zero, one = np.zeros(3), np.eye(3)
+    parts = NoiseParts(zero, one[0], one[1], zero, one[0], one[1], one[2], one[2])
+    pulses = SimpleNamespace(acc_impact_mps2=np.array([0.0, 50.0, 50.0, 0.0, 50.0]))
+    stated = NoiseLevel(1.0, 1.0), NoiseLevel(1.0, 1.0)
+    chosen = choose_inertial_noise(None, parts, pulses, stated, FusionSettings())
+    assert chosen == InertialNoise(acc_rough=-2, acc_systematic=2)
+    assert tried == [
+        [0, 0, 0, 0, 0],
+        *([-1, 0, 0, 0, 0], [-2, 0, 0, 0, 0], [-3, 0, 0, 0, 0]),  # earn 30, 10, -10
+        [-2, -1, 0, 0, 0],  # 0.2, where 2 are asked for: up is unlikelier still
+        [-2, 0, 0, 0, -1],  # 1.5
+        *([-2, 0, -1, 0, 0], [-2, 0, 1, 0, 0], [-2, 0, 2, 0, 0], [-2, 0, 3, 0, 0]),  # -50, 30, 10, -10
+        *([-2, 0, 2, -1, 0], [-2, 0, 2, 1, 0]),  # -10, -10
+    ]

@@ -131,25 +131,26 @@ def choose_inertial_noise(
 ) -> InertialNoise:
     """Return the noise of the inertial samples under which the LEDs of a run are likeliest.
 
-    One kind after the other, down as long as each step earns its price, or else up. ``parts``: at the steps.
+    One kind after the other, down as long as each step earns its price, or else up; not where a step down was
+    the likelier one and only too dear. ``parts``: at the steps.
     """
 
-    def score(choice: InertialNoise) -> float:
+    def likelihood(choice: InertialNoise) -> float:
         gyro, acc = choice.levels(stated)
-        return _log_likelihood(problem, parts.gyro(gyro), parts.acc(acc)) - _EARN_PER_STEP * choice.n_steps
+        return _log_likelihood(problem, parts.gyro(gyro), parts.acc(acc))
 
     chosen = InertialNoise()
-    best = score(chosen)
+    best = likelihood(chosen)
     for kind in _KINDS:
         for step in (-1, 1):
-            start = chosen
+            start, reached = chosen, best
             while abs(getattr(chosen, kind)) < _MOST_STEPS:
                 tried = replace(chosen, **{kind: getattr(chosen, kind) + step})
-                reached = score(tried)
-                if reached <= best:
+                reached = likelihood(tried)
+                if reached - best <= _EARN_PER_STEP * (tried.n_steps - chosen.n_steps):
                     break
                 chosen, best = tried, reached
-            if chosen is not start:
+            if chosen is not start or reached > best:
                 break
     pulse = signal.acc_impact_mps2 > settings.impact_mps2
     n_impacts = int(np.count_nonzero(pulse[1:] & ~pulse[:-1]))
