@@ -7,6 +7,7 @@ import pytest
 from brick_shakes import simulate_shake
 from scipy.spatial.transform import Rotation
 
+from bricktrack_host.fusion.clocks import offset_change
 from bricktrack_host.fusion.clocks.offset_change import change_of_halves, offset_wander
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 
@@ -83,3 +84,19 @@ def test_frames_that_are_late_by_turns_are_told_with_how_much():
     late = late_s((optical.t_ns - optical.t_ns[0]) * 1e-9, 2e-3)
     moving = slice(15, 48)  # from 0.3 to 0.95 s
     assert np.sqrt(np.mean((late[moving] / wander.sd_s[moving]) ** 2)) < 2
+
+
+def test_a_long_run_is_looked_at_in_stretches(monkeypatch):
+    optical, imu = recording(wander_s=2e-3)
+    alignment = align_times(optical, imu)
+    whole = offset_wander(optical, imu, alignment)
+    monkeypatch.setattr(offset_change, "_WANDER_STRETCH_S", 0.6)
+    halves = offset_wander(optical, imu, alignment)
+    # Each half has a steady rate of its own, which holds more of a wave of 0.7 s.
+    assert 0.4 * whole.rms_s < halves.rms_s < 1.1 * whole.rms_s
+    assert np.isfinite(halves.sd_s).all() and halves.sd_s.shape == whole.sd_s.shape
+    monkeypatch.setattr(offset_change, "_WANDER_STRETCH_S", 0.1)  # five frames, fewer than are fitted
+    assert offset_wander(optical, imu, alignment) is None
+    steady, imu = recording()
+    monkeypatch.setattr(offset_change, "_WANDER_STRETCH_S", 0.6)
+    assert offset_wander(steady, imu, align_times(steady, imu)) is None

@@ -1,11 +1,12 @@
 """By how much the offset of IMU and camera changes within a run, by the rotations that both saw."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
+from bricktrack_host.fusion.clocks.rotation_fit import MIN_POSES, Fit, RotationFit
 from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
@@ -17,6 +18,7 @@ _FREE_RATE_SD = 5e-3  # of a sensor's own clock, which a step may have falsified
 _FLOOR_S = 0.3e-3  # to which two fits of one offset agree, with all that their sd leave out
 _UNKNOWN_S = 0.1
 _WANDER_KNOT_S = 0.25
+_WANDER_STRETCH_S = 60.0  # looked at by itself: all knots of a run at once would take its length cubed
 _WANDER_SD_S = 0.02  # before the run speaks: most of an exposure
 _TELLING_S = 1e-3  # a stretch that turns too little to tell the offset as well is left out of the size
 _WANDERS_CHI2 = 12.0
@@ -123,6 +125,15 @@ class OffsetWander:
     sd_s: FloatArray
 
 
+class _Wander(NamedTuple):
+    """How far the offset is beside a steady rate at the knots of a stretch, and the chi-square of all."""
+
+    knots_s: FloatArray
+    off_s: FloatArray
+    variance_s2: FloatArray
+    chi2: float
+
+
 def offset_wander(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> OffsetWander | None:
     """Return how the offset wanders, by the rotations that both saw; None where it does not, or none tells.
 
@@ -131,27 +142,45 @@ def offset_wander(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment
     """
     if alignment.source != "data":
         return None
-    frames = has_pose(optical)
-    fit, t_s = rotation_fit_of(optical, alignment, signal_of(imu, alignment), frames, _FREE_RATE_SD)
+    seen, signal = has_pose(optical), signal_of(imu, alignment)
+    since_ns = optical.t_ns - optical.t_ns[0]
+    n_stretches = max(1, round(int(since_ns[-1]) * 1e-9 / _WANDER_STRETCH_S))
+    of_frame = since_ns * n_stretches // (since_ns[-1] + 1)
+    found = [_wander_of(optical, alignment, signal, seen & (of_frame == k)) for k in range(n_stretches)]
+    told = [one for one in found if one is not None]
+    if not told:
+        return None
+    knots_s, off = np.concatenate([one.knots_s for one in told]), np.concatenate([one.off_s for one in told])
+    own = np.concatenate([one.variance_s2 for one in told])
+    telling = own < _TELLING_S**2
+    freedom = len(knots_s) - len(told)
+    if sum(one.chi2 for one in told) < _WANDERS_CHI2 * freedom or not telling.any():
+        return None
+    rms_s = float(np.sqrt(np.average(off[telling] ** 2, weights=1 / own[telling])))
+    sd_s = np.where(telling, np.hypot(off, np.sqrt(own)), rms_s)
+    imu_s = seconds_since(alignment.imu_time_ns(optical.t_ns), signal.epoch_ns)
+    return OffsetWander(rms_s, np.interp(imu_s, knots_s, sd_s))
+
+
+def _wander_of(
+    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray
+) -> _Wander | None:
+    """Return how the offset wanders over a stretch of frames."""
+    if np.count_nonzero(frames) < MIN_POSES:
+        return None
+    fit, t_s = rotation_fit_of(optical, alignment, signal, frames, _FREE_RATE_SD)
     n = max(4, round((t_s[-1] - t_s[0]) / _WANDER_KNOT_S) + 1)
-    knots = np.linspace(t_s[0], t_s[-1], n)
-    hats = np.maximum(0.0, 1 - np.abs(t_s[:, None] - knots) / (knots[1] - knots[0]))
+    knots_s = np.linspace(t_s[0], t_s[-1], n)
+    hats = np.maximum(0.0, 1 - np.abs(t_s[:, None] - knots_s) / (knots_s[1] - knots_s[0]))
     found = fit.time_errors(hats, np.full(n, _WANDER_SD_S), alignment.gyro_bias_radps)
     if found is None:
         return None
     error, covariance = found
-    line = np.stack([np.ones(n), knots - knots.mean()], axis=1)
+    line = np.stack([np.ones(n), knots_s - knots_s.mean()], axis=1)
     rate_sd = CLOCK_RATE_SD if alignment.sample_clock is None else _FREE_RATE_SD
     steady = line @ np.diag([_UNKNOWN_S**2, rate_sd**2]) @ line.T
     beside = np.linalg.solve(covariance + steady, error)
-    off, own = error - steady @ beside, np.diagonal(covariance)
-    telling = own < _TELLING_S**2
-    if error @ beside < _WANDERS_CHI2 * (n - 1) or not telling.any():
-        return None
-    rms_s = float(np.sqrt(np.average(off[telling] ** 2, weights=1 / own[telling])))
-    sd_s = np.where(telling, np.hypot(off, np.sqrt(own)), rms_s)
-    imu_s = seconds_since(alignment.imu_time_ns(optical.t_ns), signal_of(imu, alignment).epoch_ns)
-    return OffsetWander(rms_s, np.interp(imu_s, knots, sd_s))
+    return _Wander(knots_s, error - steady @ beside, np.diagonal(covariance), float(error @ beside))
 
 
 def signal_of(imu: ImuTrack, alignment: TimeAlignment) -> ImuSignal:
