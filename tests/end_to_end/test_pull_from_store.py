@@ -1,5 +1,7 @@
 """The host's client against the device's own file server and run store, without cameras or sensors."""
 
+import errno
+import re
 import threading
 import time
 
@@ -25,10 +27,12 @@ from bricktrack_common.wire_messages import (
     RunList,
     StatusReply,
 )
+from bricktrack_device import unit_service
 from bricktrack_device.config import DeviceConfig, ServerTable, StorageTable, UnitTable
 from bricktrack_device.daemon import Daemon
 from bricktrack_device.network.file_server import FileServer
 from bricktrack_device.refusals import RequestRefusedError
+from bricktrack_device.storage.disk import storage_error
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME
 from bricktrack_host.transfer.fleet_config import UnitConfig
@@ -182,6 +186,28 @@ def test_a_run_that_the_card_has_altered_comes_as_it_is_and_says_so(daemon, tmp_
     with UnitClient(unit.address) as client:
         assert all(r.confirmed for r in client.list_runs().runs)
     assert [r.outcome for r in pull_unit(unit, tmp_path / "here").runs] == ["already here"] * 2
+
+
+@pytest.mark.parametrize(
+    ("refusal", "words"),
+    [
+        (
+            storage_error("the card", OSError(errno.ENOSPC, "No space left on device")),
+            "suspect; .*No space left",
+        ),
+        (RequestRefusedError("busy", "the unit is armed"), "the unit is armed. What came is kept"),
+    ],
+)
+def test_a_unit_that_cannot_look_at_an_altered_run_says_why(daemon, tmp_path, monkeypatch, refusal, words):
+    runs, (run_id, _), unit = daemon
+
+    def refuse(*_):
+        raise refusal
+
+    monkeypatch.setattr(unit_service, "describe_anew_if_altered", refuse)
+    flip(runs / run_id / "video.h264")
+    result = pull_unit(unit, tmp_path / "here")
+    assert len(result.errors) == 1 and re.search(words, str(result.errors[0]))
 
 
 def test_hashes_that_are_merely_wrong_are_refused_and_change_nothing(daemon):

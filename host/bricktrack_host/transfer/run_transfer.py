@@ -177,8 +177,10 @@ class _RunTransfer:
         try:
             client.confirm(self.run_id, hashes, timeout_s=_LOOK_AGAIN_S)
         except UnitError as e:
+            if e.code == "busy":
+                raise
             if e.code != "hash-mismatch":
-                raise altered from e
+                raise TransferError(f"{altered}; asked to look at it, the unit says: {e}") from e
         anew = client.describe_run(self.run_id)
         if anew == description:
             raise altered
