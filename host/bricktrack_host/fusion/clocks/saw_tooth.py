@@ -13,7 +13,12 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.fusion.clocks.saw_tooth_kernel import grid_cost, likeliest_path, optics_cost, slip_cost
+from bricktrack_host.fusion.clocks.saw_tooth_kernel import (
+    least_optics_costs,
+    likeliest_path,
+    optics_cost,
+    slip_costs,
+)
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since, usable_samples
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.inertial.running_median import running_median
@@ -210,18 +215,15 @@ class SawToothSearch:
         n = int(_MAX_RATE_ERROR / step)
         phases = np.arange(0.0, self.period_s, _GRID_STEPS * STEP_S)
         lags = np.arange(-_SIDE_S, _SIDE_S + 1e-9, _GRID_STEPS * STEP_S) - 0.5 * self.period_s
-        since_mid = self._bin_s - self._mid_s
-        best = SawTooth(0.0, 0.0, 0.0, np.inf, 0.0)
-        for rate in np.arange(-n, n + 1) * step:
-            cost = grid_cost(
-                self._cost, since_mid, self._lags_s[0], STEP_S, self.period_s * (1 + rate), rate, phases,
-                lags[0], _GRID_STEPS, len(lags),
-            )  # fmt: skip
-            cost += self._slip_cost(rate, phases, STEP_S, entices=0.0)[0][:, None]
-            i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
-            if cost[i, j] < best.cost:
-                best = SawTooth(float(rate), float(phases[i]), float(lags[j]), float(cost[i, j]), 0.0)
-        return self._refined(best)
+        rates = step * np.arange(-n, n + 1, dtype=np.float64)
+        cost, lag = least_optics_costs(
+            self._cost, self._bin_s - self._mid_s, self._lags_s[0], STEP_S, self.period_s, rates, phases,
+            lags[0], _GRID_STEPS, len(lags),
+        )  # fmt: skip
+        cost += self._slip_costs(rates, phases, STEP_S, entices=0.0)[0]
+        r, i = np.unravel_index(int(np.argmin(cost)), cost.shape)
+        values = rates[r], phases[i], lags[lag[r, i]], cost[r, i], 0.0
+        return self._refined(SawTooth(*map(float, values)))
 
     def _refined(self, way: SawTooth) -> SawTooth:
         """Return what the optics like best near the best of a grid; the cost stays the grid's."""
@@ -249,14 +251,13 @@ class SawToothSearch:
         back -= self.period_s * np.round((back - near.lag_s) / self.period_s)
         lags = back[:, None] + np.arange(-1.0, 1.01, 0.25) * STEP_S
         rates = near.rate + rate_sd * np.linspace(-2, 2, 9)
-        costs, read_costs, lag_at, kinks = [], [], [], []
-        for rate in rates:
+        slips, kinks = self._slip_costs(rates, phases, _READ_JITTER_S, entices=_KINK_TELLS)
+        costs, read_costs, lag_at = [], [], []
+        for k, rate in enumerate(rates):
             cost = self._optics(rate, phases, lags)
             j = np.argmin(cost, axis=1)
             rows = np.arange(len(phases))
-            slips, where = self._slip_cost(rate, phases, _READ_JITTER_S, entices=_KINK_TELLS)
-            read_costs.append(slips + self._repeat_cost(rate, phases))
-            kinks.append(where)
+            read_costs.append(slips[k] + self._repeat_cost(rate, phases))
             costs.append(cost[rows, j] + read_costs[-1])
             lag_at.append(lags[rows, j])
         cost = np.array(costs)
@@ -267,7 +268,7 @@ class SawToothSearch:
             if len(out) == _MAX_WAYS or cost[i, j] > cost.min() + _CONSIDERED:
                 break
             # Another way is one whose slips lie at other kinks, or one that is apart.
-            at = int(kinks[i][j]), float(phases[j])
+            at = int(kinks[i, j]), float(phases[j])
             if any(at[0] == k and abs(at[1] - p) < _APART_S for k, p in seen):
                 continue
             seen.append(at)
@@ -275,27 +276,21 @@ class SawToothSearch:
             out.append(SawTooth(*map(float, values)))
         return out
 
-    def _slip_cost(
-        self, rate: float, phases_s: FloatArray, age_sd_s: float, *, entices: float
+    def _slip_costs(
+        self, rates: FloatArray, phases_s: FloatArray, age_sd_s: float, *, entices: float
     ) -> tuple[FloatArray, IntArray]:
-        """Return what the slips of phases cost: a sample read twice, or left out, near to each of them.
+        """Return what the slips of saw-tooths cost: a sample read twice, or left out, near to each of them.
 
-        ``age_sd_s`` is how unsure the ages are. A kink where one is needed earns no more than ``entices``:
-        from afar nothing, or a clock with more slips would earn by more impacts.
+        Shape (n_rates, n_phases), and so the kinks made use of, as one number. ``age_sd_s`` is how unsure the
+        ages are. A kink where one is needed earns no more than ``entices``: from afar nothing, or a clock
+        with more slips would earn by more impacts.
         """
-        if abs(rate) < 1e-6:
-            return np.zeros(len(phases_s)), np.zeros(len(phases_s), dtype=np.int64)
-        at_s, price = self._slip_at_s, self._repeat_price
-        if rate < 0:
-            # A read that was late is spaced wrongly for reasons of its own.
-            price = np.where(self._has_next, np.maximum(self._kink_gain, -entices), 0.0)
-        sd = age_sd_s / abs(rate) / self.period_s + 1.0
-        every_s = self.period_s * (1 + rate) / rate
-        ends = np.sort((self._read_s[[0, -1]] - self._mid_s) / every_s)
-        numbers = np.arange(np.floor(ends[0]) - 1, np.ceil(ends[1]) + 2).astype(np.int64)
-        first_s = self._mid_s + phases_s / rate
-        reach = int(min(3 * sd, _MOST_REACH))
-        return slip_cost(price, at_s, first_s, every_s, numbers, sd, reach, _KINK_IS)
+        # A read that was late is spaced wrongly for reasons of its own.
+        skip_price = np.where(self._has_next, np.maximum(self._kink_gain, -entices), 0.0)
+        return slip_costs(
+            self._repeat_price, skip_price, self._slip_at_s, self._read_s[[0, -1]] - self._mid_s, self._mid_s,
+            self.period_s, rates, phases_s, age_sd_s, _MOST_REACH, _KINK_IS,
+        )  # fmt: skip
 
     def _repeat_cost(self, rate: float, phases_s: FloatArray) -> FloatArray:
         """Return what reads that found, or did not find, the sample before say of phases.

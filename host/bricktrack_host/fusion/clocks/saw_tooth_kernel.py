@@ -1,11 +1,13 @@
 """The loops of `saw_tooth`, compiled: what optics and reads say of many saw-tooths."""
 
-from math import floor
+from math import ceil, floor
 
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_host.compiled import compiled, compiled_inline
+
+_NO_RATE = 1e-6  # slips of such a clock are farther apart than any run is long
 
 
 @compiled
@@ -56,33 +58,57 @@ def optics_cost(
 
 
 @compiled
-def grid_cost(
+def least_optics_costs(
     table: FloatArray,
     since_mid_s: FloatArray,
     first_lag_s: float,
     lag_step_s: float,
     period_s: float,
-    rate: float,
+    rates: FloatArray,
     phases_s: FloatArray,
     least_lag_s: float,
     stride: int,
     n_lags: int,
-) -> FloatArray:
-    """Return what `optics_cost` does, for lags ``stride`` columns of the table apart, none beyond it."""
+) -> tuple[FloatArray, IntArray]:
+    """Return the least of `optics_cost` over lags, and at which lag, of rates and phases.
+
+    Each of shape (n_rates, n_phases). ``period_s`` is that of a sensor of rate 0; the lags are ``stride``
+    columns of the table apart, none beyond it.
+    """
     n_bins, n_table = table.shape
+    n_phases = len(phases_s)
     last = n_table - 2 - stride * (n_lags - 1)
-    out = np.zeros((len(phases_s), n_lags))
-    for m in range(n_bins):
-        for i in range(len(phases_s)):
-            age = _age(phases_s[i] - since_mid_s[m] * rate, period_s)
-            column = (age + least_lag_s - first_lag_s) / lag_step_s
-            at = min(max(int(column), 0), last)
-            later = min(max(column - at, 0.0), 1.0)
-            earlier = 1.0 - later
-            for j in range(n_lags):
-                k = at + stride * j
-                out[i, j] += earlier * table[m, k] + later * table[m, k + 1]
-    return out
+    # Columns that lags take together stand side by side: sums over the lags take half the time.
+    place = np.empty(n_table, dtype=np.int64)
+    n_placed = 0
+    for begin in range(stride):
+        for k in range(begin, n_table, stride):
+            place[k] = n_placed
+            n_placed += 1
+    ordered = np.empty_like(table)
+    for k in range(n_table):
+        ordered[:, place[k]] = table[:, k]
+    least, lag = np.empty((len(rates), n_phases)), np.empty((len(rates), n_phases), dtype=np.int64)
+    cost = np.empty((n_phases, n_lags))
+    for r in range(len(rates)):
+        cost[:] = 0.0
+        for m in range(n_bins):
+            row = ordered[m]
+            for i in range(n_phases):
+                age = _age(phases_s[i] - since_mid_s[m] * rates[r], period_s * (1 + rates[r]))
+                column = (age + least_lag_s - first_lag_s) / lag_step_s
+                at = min(max(int(column), 0), last)
+                later = min(max(column - at, 0.0), 1.0)
+                earlier = 1.0 - later
+                before = row[place[at] : place[at] + n_lags]
+                behind = row[place[at + 1] : place[at + 1] + n_lags]
+                total = cost[i]
+                for j in range(n_lags):
+                    total[j] += earlier * before[j] + later * behind[j]
+        for i in range(n_phases):
+            lag[r, i] = np.argmin(cost[i])
+            least[r, i] = cost[i, lag[r, i]]
+    return least, lag
 
 
 @compiled_inline
@@ -92,50 +118,70 @@ def _age(since_s: float, period_s: float) -> float:
 
 
 @compiled
-def slip_cost(
-    price: FloatArray,
+def slip_costs(
+    repeat_price: FloatArray,
+    skip_price: FloatArray,
     at_s: FloatArray,
-    first_slips_s: FloatArray,
-    every_s: float,
-    numbers: IntArray,
-    sd_samples: float,
-    reach: int,
+    ends_s: FloatArray,
+    mid_s: float,
+    period_s: float,
+    rates: FloatArray,
+    phases_s: FloatArray,
+    age_sd_s: float,
+    most_reach: int,
     kink_is: float,
 ) -> tuple[FloatArray, IntArray]:
     """Return what the slips of saw-tooths cost, and one number for the kinks that each makes use of.
 
+    Each of shape (n_rates, n_phases); a clock without a rate has no slips.
+
     Parameters
     ----------
-    price : ndarray, shape (n,)
-        Of a slip at each sample; away from it the price rises with the square of the distance over
-        ``sd_samples``, up to ``reach`` samples.
+    repeat_price, skip_price : ndarray, shape (n,)
+        Of a slip at each sample, where the sensor is slow and where it is fast. Away from the sample the
+        price rises with the square of the distance over its sd, up to three of it and ``most_reach`` samples.
     at_s : ndarray, shape (n,)
         When the samples were read, rising.
-    first_slips_s : ndarray, shape (n_phases,)
-        Slip number 0 of each saw-tooth.
-    every_s : float
-        From one slip to the next; may be negative.
-    numbers : ndarray of int64, shape (n_slips,)
+    ends_s : ndarray, shape (2,)
+        The first and the last read, after ``mid_s``.
+    mid_s : float
+        The read that has a saw-tooth's phase for its sample's age.
+    period_s : float
+        Of a sensor of rate 0.
+    age_sd_s : float
+        How unsure ages are.
     kink_is : float
         Below minus this a price is that of a kink.
     """
     n = len(at_s)
-    cost, kinks = np.zeros(len(first_slips_s)), np.zeros(len(first_slips_s), dtype=np.int64)
-    for p in range(len(first_slips_s)):
-        weight = 1
-        for i in range(len(numbers)):
-            slip = first_slips_s[p] + numbers[i] * every_s
-            if at_s[0] < slip < at_s[n - 1]:
-                centre = np.searchsorted(at_s, slip)
-                least, best = np.inf, 0
-                for k in range(max(centre - reach, 0), min(centre + reach + 1, n)):
-                    here = price[k] + ((k - centre) / sd_samples) ** 2
-                    if here < least:
-                        least, best = here, k
-                cost[p] += least
-                if least < -kink_is:
-                    kinks[p] += (best + 1) * weight
-            weight = weight * 7919 if i % 4 != 3 else 1
+    shape = len(rates), len(phases_s)
+    cost, kinks = np.zeros(shape), np.zeros(shape, dtype=np.int64)
+    for r in range(len(rates)):
+        rate = rates[r]
+        if abs(rate) < _NO_RATE:
+            continue
+        price = repeat_price if rate > 0 else skip_price
+        every_s = period_s * (1 + rate) / rate  # negative for a fast sensor
+        one_end, other_end = ends_s[0] / every_s, ends_s[1] / every_s
+        first = floor(min(one_end, other_end)) - 1
+        last = ceil(max(one_end, other_end)) + 1
+        sd = age_sd_s / abs(rate) / period_s + 1.0
+        reach = int(min(3 * sd, most_reach))
+        for p in range(len(phases_s)):
+            weight = 1
+            for i in range(last - first + 1):
+                slip = mid_s + phases_s[p] / rate + (first + i) * every_s
+                if at_s[0] < slip < at_s[n - 1]:
+                    centre = np.searchsorted(at_s, slip)
+                    least, best = np.inf, 0
+                    for k in range(max(centre - reach, 0), min(centre + reach + 1, n)):
+                        here = price[k] + ((k - centre) / sd) ** 2
+                        if here < least:
+                            least, best = here, k
+                    cost[r, p] += least
+                    if least < -kink_is:
+                        kinks[r, p] += (best + 1) * weight
+                weight = weight * 7919 if i % 4 != 3 else 1
     return cost, kinks
 
 
