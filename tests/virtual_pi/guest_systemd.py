@@ -26,12 +26,13 @@ BOARD = Path("/opt/virtual-pi-cpuinfo")
 HIDDEN_FROM_THE_UNIT = ("root", "home", "tmp")  # ProtectHome= and PrivateTmp=
 RUNS = Path("/var/lib/bricktrack/runs")
 WATCHDOG_S = 10  # WatchdogSec= of the unit
+# A copy of the run lacks what is still under way, 0.3 s: the first one has samples if it looks back further.
 SETTINGS = """
 backend = "hardware"
 unit.name = "virtual"
 storage.margin_mb = 1
 camera.required = false
-recording = {duration_s = 1.0, pre_roll_s = 0.2, post_roll_s = 0.2, auto_arm = true}
+recording = {duration_s = 1.0, pre_roll_s = 0.4, post_roll_s = 0.2, auto_arm = true}
 trigger = {nominal_hz = 20.0, quiet_gap_ms = 100.0}
 [[imu]]
 name = "brick"
@@ -177,7 +178,7 @@ def test_it_arms_itself_samples_in_real_time_and_saves_a_run(manager):
         time.sleep(0.2)
     manifest = read_manifest(next(RUNS.glob("*/manifest.json")))
     assert (manifest.state, manifest.simulated) == ("complete", False)
-    assert manifest.quality.edges > 15 and manifest.quality.imu_slots in (140, 141)
+    assert manifest.quality.edges > 15 and manifest.quality.imu_slots in (160, 161)
 
 
 def test_progress_feeds_the_watchdog(manager):
