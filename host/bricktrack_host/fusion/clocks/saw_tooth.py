@@ -105,6 +105,10 @@ class SawToothSearch:
         self._read_s = seconds_since(imu.t_ns, signal.epoch_ns)
         self._is_repeat = (imu.flags & int(ImuFlag.REPEAT)) != 0
         self._fresh = usable_samples(imu)
+        # What a repeat found was there in the slots before it that were not read.
+        found = self._fresh | self._is_repeat
+        next_found = np.flatnonzero(np.append(found, True))[np.cumsum(found) - found]
+        self._is_held = np.append(self._is_repeat, False)[next_found]
         # The slot of each read, and when a read in the middle one would be, were it as late as most.
         half = len(self._read_s) // 2
         slot = np.arange(len(self._read_s))
@@ -161,9 +165,7 @@ class SawToothSearch:
         slot = self._slot[fresh]
         self._slip_at_s = self._mid_s + (slot + 0.5) * self.period_s
         self._has_next = np.diff(slot, append=slot[-1]) == 1
-        self._repeat_price = np.where(
-            np.isin(fresh + 1, np.flatnonzero(self._is_repeat)), 0.0, _MISSED_REPEAT
-        )
+        self._repeat_price = np.where(np.append(self._is_held, False)[fresh + 1], 0.0, _MISSED_REPEAT)
         self._kink_gain = np.zeros(n)
         after = np.arange(4, n - 5)
         if len(after) < _KINK_WINDOW:
@@ -326,7 +328,7 @@ class SawToothSearch:
         price[~(self._fresh | self._is_repeat)] = 0.0
         unseen = np.full(len(number), _UNSEEN_SKIP)
         unseen[self._fresh] += self._kink_gain
-        path = likeliest_path(number, price, self._is_repeat, np.diff(self._slot) == 1, unseen, _FORBIDDEN)
+        path = likeliest_path(number, price, self._is_held, np.diff(self._slot) == 1, unseen, _FORBIDDEN)
         return np.asarray(np.maximum.accumulate(number[np.arange(len(number)), path]))
 
 
