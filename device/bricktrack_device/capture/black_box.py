@@ -4,6 +4,7 @@ Nothing is written to the card while a run is recorded. A daemon that is killed,
 would take the run with it; what is here is brought to the card at its next start (`storage.recovery`).
 """
 
+import errno
 import logging
 import os
 import shutil
@@ -29,6 +30,8 @@ _SHARE = 0.05
 """Of the recorder's time, at most: long runs are copied less often."""
 _ROOM = 2.0
 """Times the run's video: so much memory must be free, or there is no copy."""
+_OTHERS_BYTES = 16_000_000
+"""Stays free: other services write to the same folder in memory."""
 
 
 def black_box_folder(config: DeviceConfig) -> Path | None:
@@ -47,7 +50,8 @@ def lack_of_room(folder: Path, video_bytes: int) -> str:
     OSError
         If the folder does not tell.
     """
-    free, wanted = min(shutil.disk_usage(folder).free, memory_available_bytes() or 0), _ROOM * video_bytes
+    free = min(shutil.disk_usage(folder).free, memory_available_bytes() or 0)
+    wanted = max(_ROOM * video_bytes, video_bytes + _OTHERS_BYTES)
     if free >= wanted:
         return ""
     return (
@@ -136,10 +140,13 @@ class BlackBox:
             fill(contents)
             _replace(run / name, contents.getvalue())
         if recording.video is not None:
-            packets = recording.video.packets
+            new = [p.data for p in recording.video.packets[self._n_packets :]]
+            # With a fixed quantiser, or in noise, a video grows beyond what its bit rate promised.
+            if shutil.disk_usage(run).free - sum(map(len, new)) < _OTHERS_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             with (run / VIDEO_NAME).open("ab") as file:
-                file.writelines(p.data for p in packets[self._n_packets :])
-            self._n_packets = len(packets)
+                file.writelines(new)
+            self._n_packets += len(new)
 
 
 def _replace(path: Path, data: bytes) -> None:

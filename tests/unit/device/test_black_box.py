@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -168,6 +169,24 @@ def test_without_room_in_memory_there_is_no_copy_and_a_word(
     black_box.begin("unit-1_b3f2a7_0001", 10**15)
     black_box.take(lambda: recording("unit-1_b3f2a7_0001"))
     assert not list((tmp_path / "box").iterdir()) and "no copy in memory" in caplog.text
+
+
+def test_a_video_that_outgrows_its_bit_rate_leaves_room_for_other_services(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    free = [17_000_000]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free[0]))
+    black_box = BlackBox(tmp_path / "box")
+    black_box.begin("unit-1_b3f2a7_0001", 2_000_000)  # 17 MB hold it twice, but not it and what others need
+    assert not black_box.run_id and "18 MB are wanted" in caplog.text
+
+    black_box.begin("unit-1_b3f2a7_0001", 1000)
+    black_box.take(lambda: cut_after(recording("unit-1_b3f2a7_0001"), 3))
+    assert (tmp_path / "box" / "unit-1_b3f2a7_0001" / "video.h264").stat().st_size == 300
+    free[0] = 16_000_000 + 100 * (N_FRAMES - 3) - 1  # a byte less than the rest of the video wants
+    black_box.take(lambda: recording("unit-1_b3f2a7_0001"))
+    assert not black_box.run_id and not list((tmp_path / "box").iterdir())
+    assert "its copy in memory ends: [Errno 28] No space left" in caplog.text
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), KeyError("a bug")])
