@@ -325,11 +325,20 @@ class SawToothSearch:
         number = np.floor(since_s / period).astype(np.int64)[:, None] + np.array([-1, 0, 1])
         age = since_s[:, None] - number * period
         price = (np.maximum(np.maximum(-age, age - period), 0.0) / _READ_JITTER_S) ** 2
-        price[~(self._fresh | self._is_repeat)] = 0.0
         unseen = np.full(len(number), _UNSEEN_SKIP)
         unseen[self._fresh] += self._kink_gain
-        path = likeliest_path(number, price, self._is_held, np.diff(self._slot) == 1, unseen, _FORBIDDEN)
-        return np.asarray(np.maximum.accumulate(number[np.arange(len(number)), path]))
+        # Slots that were not read found nothing: a repeat is of the last one that was.
+        read = np.flatnonzero(self._fresh | self._is_repeat)
+        path = likeliest_path(
+            number[read], price[read], self._is_repeat[read], np.diff(self._slot[read]) == 1, unseen[read],
+            _FORBIDDEN,
+        )  # fmt: skip
+        sample, taken = number[:, 1].copy(), np.maximum.accumulate(number[read, path])
+        n_before = np.searchsorted(read, np.arange(len(sample)))
+        later = n_before < len(read)
+        sample[later] = np.minimum(sample[later], taken[n_before[later]])
+        sample[read] = taken
+        return np.asarray(np.maximum.accumulate(sample))
 
 
 def _spread(values: FloatArray) -> FloatArray:
