@@ -99,6 +99,15 @@ def test_a_motion_that_shows_leds_in_a_plane_as_their_mirrored_pose_is_seen_thro
     assert not (track.flags & PoseFlag.AMBIGUOUS).any()
 
 
+@pytest.mark.parametrize("leds", [(0, 2, 3, 5), (0, 1, 4, 5), (1, 3, 4, 5)])
+def test_a_moving_frame_with_four_leds_starts_at_the_pose_that_is_near_its_neighbours(leds):
+    uv, R = rolling_pixels(12, tilt_deg=12.0)
+    uv[5, [k for k in range(7) if k not in leds]] = np.nan
+    first = start_poses(observations(uv, sd=0.05), CAMERA, BRICK)
+    # One instant leaves some degrees of 20 ms of motion; what fits that instant best is over 40 off.
+    assert turn_deg(first.R_camera_brick[5:6], R[5:6])[0] < 5
+
+
 def test_no_pose_of_a_rocked_brick_is_wrong_and_sure_whichever_leds_are_hidden():
     n_refused = 0
     for leds in set(combinations(range(7), 4)) - {(0, 3, 4, 5)}:  # those are one column: no pose at all

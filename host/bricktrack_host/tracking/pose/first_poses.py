@@ -1,7 +1,8 @@
 """A first pose of every frame, taken for one instant: from PRSOI, and from three LEDs where that is in doubt.
 
 A frame with few LEDs can have two poses that the pixels cannot tell apart. It gets none, unless the frame
-beside it is near one of the two and far from the other.
+beside it is near one of the two and far from the other. In motion, taken for one instant, the wrong one can
+fit better: then too the frame beside it tells, if it has one pose only.
 """
 
 from dataclasses import dataclass
@@ -111,9 +112,19 @@ def _other_starts(
     all_t = np.concatenate([t_try[posed], t_out[i, None]], axis=1)
     best = np.arange(len(posed)), np.argmin(all_chi2, axis=1)
     R_out[i], t_out[i] = all_R[best], all_t[best]
-    row, rival = np.nonzero(all_chi2 < all_chi2[best][:, None] + RIVAL_CHI2)
-    turn = rvec_from_matrix(np.swapaxes(R_out[i[row]], -1, -2) @ all_R[row, rival])
-    ambiguous[i[row[np.linalg.norm(turn, axis=1) > SAME_POSE_RAD]]] = True
+    # Taken for one instant a frame in motion misfits: what of its poses fits best says no more than a frame
+    # beside it that leaves no choice.
+    least = all_chi2[best]
+    misfit = np.maximum(least / np.maximum(degrees_of_freedom(uv[i]), 1), 1.0)
+    row, rival = np.nonzero(all_chi2 < (least + RIVAL_CHI2 * misfit)[:, None])
+    turn = np.linalg.norm(rvec_from_matrix(np.swapaxes(R_out[i[row]], -1, -2) @ all_R[row, rival]), axis=1)
+    apart = turn > SAME_POSE_RAD
+    is_open = np.zeros(n, dtype=bool)
+    is_open[i[row[apart]]] = True
+    ambiguous[i[row[apart & (all_chi2[row, rival] < least[row] + RIVAL_CHI2)]]] = True
+    alike = all_chi2 / misfit[:, None]
+    believe_neighbours(is_open, R_out, t_out, all_R, all_t, alike, i, t_ns, one_by_one=False)
+    ambiguous &= is_open
     believe_neighbours(ambiguous, R_out, t_out, R_try, t_try, chi2, frames, t_ns)
     R_out[ambiguous] = np.nan
     changed = frames[((R_out != poses.R_camera_brick) | np.isnan(R_out)).any(axis=(1, 2))[frames]]
@@ -189,10 +200,16 @@ def believe_neighbours(
     chi2: FloatArray,
     frames: IntArray,
     t_ns: IntArray,
+    *,
+    one_by_one: bool = True,
 ) -> None:
-    """Settle frames with two poses by the frame beside them, if near one and far from the other."""
+    """Settle frames with two poses by the frame beside them, if near one and far from the other.
+
+    One by one: what is settled settles the next.
+    """
     if not ambiguous.any():
         return
+    may_settle = ~ambiguous
     period = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
     row_of = {int(i): row for row, i in enumerate(frames)}
     for order in (range(len(t_ns)), range(len(t_ns) - 1, -1, -1)):
@@ -209,7 +226,7 @@ def believe_neighbours(
                     pick = index[rank[0]]
                     R[i], t[i] = R_try[row, pick], t_try[row, pick]
                     ambiguous[i] = False
-            if not ambiguous[i] and np.isfinite(R[i]).all():
+            if (may_settle[i] or (one_by_one and not ambiguous[i])) and np.isfinite(R[i]).all():
                 before = i
 
 
