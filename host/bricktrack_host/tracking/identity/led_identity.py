@@ -199,7 +199,7 @@ def _verified(
     at, some = frames[suspect], lights.take(suspect)
     start = (verified.poses.R_camera_brick[suspect], verified.poses.t_camera_brick_mm[suspect])
     again = run.verify(some, start, intruders=True, n_lights=run.lights.count[at])
-    hit = np.flatnonzero(~(again.poses.chi2 <= _BELIEVED_CHI2))
+    hit = np.flatnonzero(again.is_scattered | ~(again.poses.chi2 <= _BELIEVED_CHI2))
     if hit.size:
         moving = _without_intruders(run, some.take(hit), (start[0][hit], start[1][hit]), at[hit])
         again = again.replaced(hit, moving)
