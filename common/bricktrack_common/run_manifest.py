@@ -226,7 +226,3 @@ def is_run_id(text: str) -> bool:
     (True, False, False)
     """
     return re.fullmatch(RUN_ID_PATTERN, text) is not None
-
-
-# msgspec prepares a type when it is first used, and crashes where several threads do that at once: not later.
-msgspec.json.Decoder(RunManifest)

@@ -6,6 +6,7 @@
 import re
 import tomllib
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import msgspec
@@ -13,6 +14,8 @@ import msgspec
 from bricktrack_common.errors import BricktrackError, ConfigError, RunFormatError
 
 T = TypeVar("T")
+_CONVERTING = Lock()
+"""msgspec prepares a type when it is first used, and crashes where several threads do that at once."""
 
 _OUR_WORDS = (
     (re.compile(r"Object missing required field `(\w+)`"), r"required field '\1' is missing"),
@@ -39,7 +42,8 @@ def convert(data: object, kind: type[T], *, where: str, error: type[BricktrackEr
         The error to raise, so that a wire message fails as a `ProtocolError` and a file as its own.
     """
     try:
-        return msgspec.convert(data, kind, strict=True)
+        with _CONVERTING:
+            return msgspec.convert(data, kind, strict=True)
     except msgspec.ValidationError as e:
         text = str(e)
         problem, _, key = text.partition(" - at `")
