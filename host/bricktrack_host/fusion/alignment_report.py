@@ -195,8 +195,7 @@ def report_alignment(
         )
         if with_mount:
             mount = refine_mount(optical, imu, lever_arm_mm=lever_arm_mm, alignment=alignment)
-    clock = alignment.sample_clock
-    signal = ImuSignal.from_track(imu if clock is None else clock.restamp(imu))
+    signal = ImuSignal.from_track(alignment.restamped(imu))
     seen = has_pose(optical)
     t_ns, R = optical.t_ns[seen], optical.R_camera_brick[seen]
     t_cam_s, t_imu_s = (seconds_since(t, signal.epoch_ns) for t in (t_ns, alignment.imu_time_ns(t_ns)))

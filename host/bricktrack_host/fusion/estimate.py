@@ -238,7 +238,7 @@ def prepare_run(item: FusionInput, settings: FusionSettings) -> Run:
         both = item.camera_alignment or align_both(item.optical, item.imu, item.camera)
         alignment, motion = both.brick, both.motion
         is_near = "stamps" not in (both.brick.source, both.camera.source)
-    imu = item.imu if alignment.sample_clock is None else alignment.sample_clock.restamp(item.imu)
+    imu = alignment.restamped(item.imu)
     run = Run.from_tracks(
         item.optical, imu, alignment,
         lever_arm_mm=lever_arm_mm, output_t_ns=item.output_t_ns, camera=motion,

@@ -91,7 +91,7 @@ def refine_mount(
     alignment = alignment or align_times(optical, imu)
     if alignment.source != "data":
         raise TrackingError(f"the mount of the IMU cannot be refined: {alignment.reason}")
-    imu = imu if alignment.sample_clock is None else alignment.sample_clock.restamp(imu)
+    imu = alignment.restamped(imu)
     rvec, rvec_sd = _axes(optical, imu, alignment)
     found, sd = _place(optical, imu, alignment, arm, settings)
     run = Run.from_tracks(optical, imu, alignment, lever_arm_mm=arm, output_t_ns=optical.t_ns[:0])

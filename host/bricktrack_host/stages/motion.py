@@ -111,8 +111,7 @@ def words_on_knocks(optical: OpticalTrack, inertial: Inertial | None) -> list[st
 def _frames_unfelt(optical: OpticalTrack, inertial: Inertial) -> BoolArray:
     """Return which frames have an LED whose instant lies in a long gap of the inertial samples, or beyond."""
     alignment = inertial.alignment
-    clock = alignment.sample_clock
-    signal = ImuSignal.from_track(inertial.imu if clock is None else clock.restamp(inertial.imu))
+    signal = ImuSignal.from_track(alignment.restamped(inertial.imu))
     instants_ns = np.concatenate([optical.t_ns[:, None], optical.led_t_ns], axis=1)
     t_s = seconds_since(alignment.imu_time_ns(instants_ns), signal.epoch_ns)
     return np.asarray(signal.in_gap(t_s, least_periods=BRIDGE_PERIODS).any(axis=1))

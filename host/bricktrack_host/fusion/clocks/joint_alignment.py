@@ -124,9 +124,7 @@ def align_jointly(
 
 
 def _sensor(imu: ImuTrack, alignment: TimeAlignment, bias_radps: FloatArray) -> _Sensor:
-    clock = alignment.sample_clock
-    own = imu if clock is None else clock.restamp(imu)
-    return _Sensor(own, alignment.offset_ns * 1e-9, alignment.skew, bias_radps)
+    return _Sensor(alignment.restamped(imu), alignment.offset_ns * 1e-9, alignment.skew, bias_radps)
 
 
 def _moved(sensor: _Sensor, offset_s: float, skew: float) -> _Sensor:

@@ -185,10 +185,7 @@ def _wander_of(
 
 def signal_of(imu: ImuTrack, alignment: TimeAlignment) -> ImuSignal:
     """Return the samples as a signal, by the sensor's clock and low-pass as they were found."""
-    clock = alignment.sample_clock
-    return ImuSignal.from_track(
-        imu if clock is None else clock.restamp(imu), gyro_filter_s=alignment.gyro_filter_s
-    )
+    return ImuSignal.from_track(alignment.restamped(imu), gyro_filter_s=alignment.gyro_filter_s)
 
 
 def rotation_fit_of(

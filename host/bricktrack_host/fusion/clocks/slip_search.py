@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
-from bricktrack_host.fusion.clocks.offset_change import offset_change
+from bricktrack_host.fusion.clocks.offset_change import offset_change, signal_of
 from bricktrack_host.fusion.clocks.rotation_fit import MIN_POSES, correlate
 from bricktrack_host.fusion.clocks.rotation_fit_kernel import integrated_attitudes
 from bricktrack_host.fusion.clocks.slip_search_kernel import (
@@ -164,10 +164,7 @@ def _turns(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, perio
     At the alignment's offset, and a third of a period to either side: the one offset that was found for
     stamps that slip may lie half-way between those that they have. Empty where too few frames compare.
     """
-    clock = alignment.sample_clock
-    signal = ImuSignal.from_track(
-        imu if clock is None else clock.restamp(imu), gyro_filter_s=alignment.gyro_filter_s
-    )
+    signal = signal_of(imu, alignment)
     frame = np.flatnonzero(has_pose(optical))
     period_s = period_ns * 1e-9
     shifts_s = np.arange(-3 * _MOST_PERIODS - 1, 3 * _MOST_PERIODS + 2) * period_s / 3

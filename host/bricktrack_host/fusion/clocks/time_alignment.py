@@ -95,10 +95,13 @@ class TimeAlignment:
         since_ns = (t_ns - self.t_mid_ns).astype(np.float64) - self.offset_ns
         return np.asarray(self.t_mid_ns + np.round(since_ns / (1 + self.skew)).astype(np.int64))
 
+    def restamped(self, imu: ImuTrack) -> ImuTrack:
+        """Return the samples by the sensor's own clock, in IMU time; as they are where none was found."""
+        return imu if self.sample_clock is None else self.sample_clock.restamp(imu)
+
     def sampled_ns(self, imu: ImuTrack) -> IntArray:
         """Return when each sample was taken, in camera time: a read finds a sample that may be a slot old."""
-        sampled = imu if self.sample_clock is None else self.sample_clock.restamp(imu)
-        return self.camera_time_ns(sampled.t_ns)
+        return self.camera_time_ns(self.restamped(imu).t_ns)
 
 
 def has_pose(optical: OpticalTrack) -> BoolArray:

@@ -34,8 +34,7 @@ class Felt:
 
     def __init__(self, hint: InertialHint) -> None:
         self._alignment = hint.alignment
-        clock = hint.alignment.sample_clock
-        imu = hint.imu if clock is None else clock.restamp(hint.imu)
+        imu = hint.alignment.restamped(hint.imu)
         self.signal = ImuSignal.from_track(imu, gyro_filter_s=hint.alignment.gyro_filter_s)
         self._bias = mean_rate(hint.imu)
         self._attitude = Attitude(self.signal, self._bias)

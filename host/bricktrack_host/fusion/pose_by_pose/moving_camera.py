@@ -271,8 +271,7 @@ def _without(
     if alignment is None:
         restamped, t_ns, filter_s = imu, optical.t_ns, 0.0
     else:
-        clock = alignment.sample_clock
-        restamped = imu if clock is None else clock.restamp(imu)
+        restamped = alignment.restamped(imu)
         t_ns, filter_s = alignment.imu_time_ns(optical.t_ns), alignment.gyro_filter_s
     signal = ImuSignal.from_track(restamped, gyro_filter_s=filter_s)
     R = Attitude(signal, mean_rate(imu)).at(seconds_since(t_ns, signal.epoch_ns))
@@ -284,11 +283,9 @@ def camera_motion(
     camera: CameraImu, alignment: TimeAlignment, imu: ImuTrack, brick: TimeAlignment
 ) -> CameraMotion:
     """Return the camera's motion by its sensor, at instants of the brick's."""
-    clock = alignment.sample_clock
-    own = camera.imu if clock is None else clock.restamp(camera.imu)
+    own = alignment.restamped(camera.imu)
     signal = ImuSignal.from_track(own, gyro_filter_s=alignment.gyro_filter_s)
-    clock = brick.sample_clock
-    epoch_ns = ImuSignal.from_track(imu if clock is None else clock.restamp(imu)).epoch_ns
+    epoch_ns = ImuSignal.from_track(brick.restamped(imu)).epoch_ns
     bias = closing_bias(signal, mean_rate(camera.imu))
     return CameraMotion(
         imu=own,
