@@ -174,15 +174,15 @@ def _print(fitted: RayCalibration, *, names: list[str], simulated: bool) -> None
     table.add_row("depth, mm", *(f"{r.z_mm:.3f}" for r in rs))
     table.add_row("dots used", *(str(r.n_dots) for r in rs))
     table.add_row("dots left out", *(str(n) for n in fitted.n_left_out))
-    table.add_row("mean residual, um", *(f"{r.mean_um:.2f}" for r in rs))
-    table.add_row("rms residual, um", *(f"{r.rms_um:.2f}" for r in rs))
-    table.add_row("max residual, um", *(f"{r.max_um:.2f}" for r in rs))
-    table.add_row("rays known to at dots (95 %), um", *(f"{sd[covered].max():.2f}" for sd in sd_um))
-    table.add_row("... over the whole picture, um", *(f"{sd.max():.2f}" for sd in sd_um))
+    table.add_row("mean residual, µm", *(f"{r.mean_um:.2f}" for r in rs))
+    table.add_row("rms residual, µm", *(f"{r.rms_um:.2f}" for r in rs))
+    table.add_row("max residual, µm", *(f"{r.max_um:.2f}" for r in rs))
+    table.add_row("rays known to at dots (95 %), µm", *(f"{sd[covered].max():.2f}" for sd in sd_um))
+    table.add_row("... over the whole picture, µm", *(f"{sd.max():.2f}" for sd in sd_um))
     console.print(table)
 
     candidates = Table(title="Error at dots left out of the fit")
-    for heading in ("model", "rms um", "max um", "noise over the picture um", ""):
+    for heading in ("model", "rms µm", "max µm", "noise over the picture µm", ""):
         text = heading in ("model", "")
         candidates.add_column(heading, justify="left" if text else "right", no_wrap=heading == "model")
     for c in choice.candidates:

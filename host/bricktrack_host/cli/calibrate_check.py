@@ -35,7 +35,7 @@ def check(
         typer.Option(help="A pixel near the origin, for a plain target.", metavar="U V"),
     ] = None,
     board_um: Annotated[
-        float, typer.Option(min=0, help="How well the board is made: standard deviation of its dots, um.")
+        float, typer.Option(min=0, help="How well the board is made: standard deviation of its dots, µm.")
     ] = 10.0,
     depth_mm: Annotated[
         float, typer.Option("--depth-tolerance-mm", min=0, help="How well the depths given are known, mm.")
@@ -153,8 +153,8 @@ def _problems(page: "BoardCheck", z_mm: float | None, tolerance_mm: float) -> li
     words = []
     if page.ratio > MAX_RATIO:
         words.append(
-            f"residuals of {page.rms_um:.1f} um rms are {page.ratio:.1f} times what is stated "
-            f"({page.stated_um:.1f} um); up to {MAX_RATIO:g} times is usual"
+            f"residuals of {page.rms_um:.1f} µm rms are {page.ratio:.1f} times what is stated "
+            f"({page.stated_um:.1f} µm); up to {MAX_RATIO:g} times is usual"
         )
     if z_mm is not None:
         off, allowed = page.depth_mm - z_mm, tolerance_mm + 3 * page.depth_sd_mm
@@ -183,10 +183,10 @@ def _report(
         table.add_column(name, justify="right")
     table.add_row("dots", *(str(len(p.uv_px)) for p in pages))
     table.add_row("dots left out", *(str(p.n_outliers) for p in pages))
-    table.add_row("mean residual, um", *(f"{p.mean_um:.2f}" for p in pages))
-    table.add_row("rms residual, um", *(f"{p.rms_um:.2f}" for p in pages))
-    table.add_row("max residual, um", *(f"{p.max_um:.2f}" for p in pages))
-    table.add_row("stated rms, um", *(f"{p.stated_um:.2f}" for p in pages))
+    table.add_row("mean residual, µm", *(f"{p.mean_um:.2f}" for p in pages))
+    table.add_row("rms residual, µm", *(f"{p.rms_um:.2f}" for p in pages))
+    table.add_row("max residual, µm", *(f"{p.max_um:.2f}" for p in pages))
+    table.add_row("stated rms, µm", *(f"{p.stated_um:.2f}" for p in pages))
     table.add_row("residual by stated", *(f"{p.ratio:.2f}" for p in pages))
     table.add_row("depth found, mm", *(f"{p.depth_mm:.3f} +- {p.depth_sd_mm:.3f}" for p in pages))
     table.add_row("depth given, mm", *("" if z is None else f"{z:.3f}" for z in depths))

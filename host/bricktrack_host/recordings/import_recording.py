@@ -179,7 +179,7 @@ def _match(recording: Recording, video: LooseVideo, stamps_us: IntArray, missing
     holes = np.flatnonzero(steps > _GAP_PERIODS * np.median(steps)) if steps.size else np.empty(0, np.int64)
     if stamps_us[0] != 0:
         raise VideoError(
-            f"{counts}, and the first stamp is {stamps_us[0]} us, not 0: what is missing may be at the "
+            f"{counts}, and the first stamp is {stamps_us[0]} µs, not 0: what is missing may be at the "
             "beginning. Make them agree by hand"
         )
     if holes.size and holes[0] + 1 < n:

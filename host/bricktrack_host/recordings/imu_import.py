@@ -90,7 +90,7 @@ def import_imu(
     samples = decode_imu(description, records)
     counts = {f: int(np.count_nonzero(samples.flags & int(f))) for f in ImuFlag}
     notes = [
-        f"{len(records)} samples every {period_ns / 1e6:.4f} ms, within {worst_ns / 1e3:.0f} us of that grid",
+        f"{len(records)} samples every {period_ns / 1e6:.4f} ms, within {worst_ns / 1e3:.0f} µs of that grid",
         acc_note,
         gyro_note,
     ]

@@ -71,7 +71,7 @@ def read_timestamps(path: Path, *, unit: TimestampUnit = "auto") -> IntArray:
             if value and value.adjusted() > _MAX_DECIMAL_EXPONENT:  # before a million digits are written out
                 raise OverflowError
             if value != value.to_integral_value() and unit == "us":
-                raise VideoError(f"{path}: line {n}: {text!r} us is no whole number. Is the file in ms?")
+                raise VideoError(f"{path}: line {n}: {text!r} µs is no whole number. Is the file in ms?")
             stamps[i] = int(value.to_integral_value())
         except (ArithmeticError, ValueError) as e:  # of Decimal, int and int64
             if isinstance(e, VideoError):
@@ -88,7 +88,7 @@ def read_timestamps(path: Path, *, unit: TimestampUnit = "auto") -> IntArray:
         step_us = float(np.median(np.diff(stamps)))
         if not 1e6 / _MAX_FRAME_RATE_HZ <= step_us <= 10e6:
             raise VideoError(
-                f"{path}: read in {unit}, the stamps are {step_us:g} us apart, which no camera run here is. "
+                f"{path}: read in {unit}, the stamps are {step_us:g} µs apart, which no camera run here is. "
                 "Give the unit with --timestamps-unit"
             )
     return stamps

@@ -34,9 +34,9 @@ def residual_contour_figure(planes: Planes, residual_mm: Sequence[FloatArray]) -
     for ax, (z_mm, seen), size in zip(axes, planes, sizes, strict=True):
         filled = ax.tricontourf(_triangles(seen.xy_mm), size, levels=levels, cmap=COLOURS, extend="max")
         ax.plot(*seen.xy_mm.T, ".", ms=1.6, mew=0, color="white")
-        ax.set_title(f"z = {z_mm:g} mm: mean {size.mean():.1f}, max {size.max():.1f} um")
+        ax.set_title(f"z = {z_mm:g} mm: mean {size.mean():.1f}, max {size.max():.1f} µm")
         _plane_labels(ax)
-    _colour_bar(fig, filled, "residual, um", form="%.1f")
+    _colour_bar(fig, filled, "residual, µm", form="%.1f")
     return fig
 
 
@@ -48,7 +48,7 @@ def residual_arrow_figure(planes: Planes, residual_mm: Sequence[FloatArray]) -> 
         step = _spacing(seen.xy_mm)
         ax.quiver(*seen.xy_mm.T, *r.T, angles="xy", scale_units="xy",
                   scale=max(typical, 1e-9) / (0.7 * step), width=0.0016, color=OPTICAL)  # fmt: skip
-        ax.set_title(f"z = {z_mm:g} mm: an arrow of one dot distance is {1e3 * typical / 0.7:.1f} um")
+        ax.set_title(f"z = {z_mm:g} mm: an arrow of one dot distance is {1e3 * typical / 0.7:.1f} µm")
         _plane_labels(ax)
     return fig
 
@@ -67,7 +67,7 @@ def residual_surface_figure(planes: Planes, residual_mm: Sequence[FloatArray]) -
             x, y, height, cmap=COLOURS, vmin=0, vmax=top, rcount=29, ccount=49, linewidth=0.15,
             edgecolor=INK, antialiased=True,
         )  # fmt: skip
-        ax.set(zlim=(0, top), xlabel="x, mm", ylabel="y, mm", zlabel="residual, um")
+        ax.set(zlim=(0, top), xlabel="x, mm", ylabel="y, mm", zlabel="residual, µm")
         ax.locator_params(axis="z", nbins=5)
         ax.zaxis.labelpad = -1
         ax.set_box_aspect((1.75, 1.0, 0.62), zoom=1.12)
@@ -86,9 +86,9 @@ def left_out_figure(planes: Planes, errors_mm: Sequence[FloatArray]) -> Figure:
         x, y = seen.xy_mm.T
         shown = ax.scatter(x, y, c=size, s=9, cmap=COLOURS, vmin=0, vmax=max(top, 1e-6), linewidths=0)
         rms = np.sqrt(np.mean(size**2))
-        ax.set_title(f"z = {z_mm:g} mm: rms {rms:.1f}, max {size.max():.1f} um")
+        ax.set_title(f"z = {z_mm:g} mm: rms {rms:.1f}, max {size.max():.1f} µm")
         _plane_labels(ax)
-    _colour_bar(fig, shown, "error when left out, um", form="%.1f")
+    _colour_bar(fig, shown, "error when left out, µm", form="%.1f")
     return fig
 
 
@@ -148,14 +148,14 @@ def uncertainty_figure(
                 Polygon(leds.vertices_px, closed=True, fc="none", ec="white", lw=1.4, ls=(0, (5, 2)))
             )
             inside = leds.contains(uv)
-            words = f"; LEDs up to {size[inside].max():.1f} um" if inside.any() else ""
+            words = f"; LEDs up to {size[inside].max():.1f} µm" if inside.any() else ""
         else:
-            words = f"; median {np.median(size):.2g} um"
+            words = f"; median {np.median(size):.2g} µm"
         ax.set_title(f"z = {z_mm:.1f} mm{words}")
         ax.set(xlim=(-0.5, mode.width - 0.5), ylim=(mode.height - 0.5, -0.5), xlabel="u, px")
         ax.grid(visible=False)
     axes[0].set_ylabel("v, px")
-    _colour_bar(fig, filled, "95 % half-axis, um", form="%.2g")
+    _colour_bar(fig, filled, "95 % half-axis, µm", form="%.2g")
     return fig
 
 
@@ -172,7 +172,7 @@ def comparison_figure(comparison: CalibrationComparison, mode: SensorMode) -> Fi
         longest = max(float(size.max()), 1e-6)
         ax.quiver(*comparison.uv_px[every].T, *(1e3 * moved[every]).T, angles="xy", scale_units="xy",
                   scale=longest / 120, width=0.0018, color=FUSED)  # fmt: skip
-        ax.set_title(f"{words}: rms {np.sqrt(np.mean(size**2)):.1f}, longest arrow {longest:.1f} um")
+        ax.set_title(f"{words}: rms {np.sqrt(np.mean(size**2)):.1f}, longest arrow {longest:.1f} µm")
         ax.set(xlim=(-0.5, mode.width - 0.5), ylim=(mode.height - 0.5, -0.5), xlabel="u, px", ylabel="v, px")
     return fig
 

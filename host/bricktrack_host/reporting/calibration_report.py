@@ -117,7 +117,7 @@ def verdict(evidence: CalibrationEvidence) -> tuple[str, list[str]]:
     if evidence.comparison is not None and evidence.comparison.explained_share < 0.5:
         problems.append("The lens is not what it was at the earlier calibration, beyond both uncertainties.")
     worst = max(r.mean_um for r in fitted.model.residuals)
-    line = f"Dots lie {worst:.1f} um from the rays on average, at the worse plane; {fitted.choice.reason}."
+    line = f"Dots lie {worst:.1f} µm from the rays on average, at the worse plane; {fitted.choice.reason}."
     return line, problems
 
 
@@ -158,20 +158,20 @@ def _key_figures(evidence: CalibrationEvidence) -> list[Key]:
     sd_um = 1e3 * CHI_95 * model.point_sd_mm(uv, middle)
     keys = [
         Key("Model", choice.model, f"{'degrees held up to' if choice.held else 'order'} {choice.order}"),
-        Key("Mean residual", " · ".join(f"{r.mean_um:.2f}" for r in model.residuals) + " um", "each plane"),
-        Key("Maximum residual", " · ".join(f"{r.max_um:.1f}" for r in model.residuals) + " um",
+        Key("Mean residual", " · ".join(f"{r.mean_um:.2f}" for r in model.residuals) + " µm", "each plane"),
+        Key("Maximum residual", " · ".join(f"{r.max_um:.1f}" for r in model.residuals) + " µm",
              "each plane"),
         Key("Dots", " · ".join(str(r.n_dots) for r in model.residuals),
              f"{sum(fitted.n_left_out)} left out as contradicting"),
-        Key("Error at left-out dots", f"{chosen.rms_um:.2f} um", f"rms; {chosen.max_um:.1f} um at most"),
+        Key("Error at left-out dots", f"{chosen.rms_um:.2f} µm", f"rms; {chosen.max_um:.1f} µm at most"),
         Key("Picture covered", f"{100 * evidence.covered_share:.0f} %", "by dots around"),
-        Key("Rays known to", f"{np.median(sd_um[model.is_covered(uv)]):.2f} um",
+        Key("Rays known to", f"{np.median(sd_um[model.is_covered(uv)]):.2f} µm",
              "95 %, median where covered, midway"),
     ]  # fmt: skip
     if evidence.leds is not None:
         inside = evidence.leds.contains(uv)
         if inside.any():
-            keys.append(Key("... at the LEDs", f"{sd_um[inside].max():.2f} um", "95 %, at most, midway"))
+            keys.append(Key("... at the LEDs", f"{sd_um[inside].max():.2f} µm", "95 %, at most, midway"))
     return keys
 
 

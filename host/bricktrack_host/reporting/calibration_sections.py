@@ -86,7 +86,7 @@ def _residuals(e: CalibrationEvidence, figures: dict[str, Figure]) -> Section:
         rows.append(
             [f"{r.z_mm:g} mm", str(r.n_dots), *(f"{x:.2f}" for x in cells), f"{stated:.3f}", f"{scatter:.3f}"]
         )
-    head = ["plane", "dots", "mean, um", "rms, um", "95 % below, um", "max, um", "stated noise, px",
+    head = ["plane", "dots", "mean, µm", "rms, µm", "95 % below, µm", "max, µm", "stated noise, px",
             "found noise, px"]  # fmt: skip
     section.tables.append(SectionTable("", head, rows, 1))
     figures["residual-contours"] = draw.residual_contour_figure(planes, fit.residual_mm)
@@ -120,7 +120,7 @@ def _left_out(e: CalibrationEvidence, figures: dict[str, Figure]) -> Section:
         taken = (c.model, c.order, c.held) == (choice.model, choice.order, choice.held)
         figures_um = [c.rms_um, c.max_um, c.picture_noise_um, c.expected_um]
         rows.append([c.name, "taken" if taken else "", *(f"{x:.2f}" for x in figures_um)])
-    head = ["model", "", "rms, um", "max, um", "noise over the picture, um", "expected error, um"]
+    head = ["model", "", "rms, µm", "max, µm", "noise over the picture, µm", "expected error, µm"]
     section.tables.append(SectionTable("", head, rows, 2))
     ends = np.cumsum([len(d) for _, d in planes])[:-1]
     errors = np.split(left_out_errors_mm(fit, block_folds(planes)), ends)
@@ -173,13 +173,13 @@ def _board(e: CalibrationEvidence) -> Section:
         section.words.append("Too few dots were seen at both planes to tell the print from noise.")
     elif found.sd_um > 0:
         section.words.append(
-            f"Print: {found.n_common} dots seen at both planes are off their places by {found.sd_um:.1f} um "
+            f"Print: {found.n_common} dots seen at both planes are off their places by {found.sd_um:.1f} µm "
             "in x and in y (standard deviation), the same at both. It averages out over many dots."
         )
     else:
         section.words.append(
             f"Print: {found.n_common} dots seen at both planes show no error of their own; more than "
-            f"{found.limit_um:.1f} um would have been seen. What is smooth over the board would not."
+            f"{found.limit_um:.1f} µm would have been seen. What is smooth over the board would not."
         )
     shape = pixel_shape(model)
     section.words.append(
@@ -225,10 +225,10 @@ def _comparison(
         "Against the earlier calibration",
         [
             f"Earlier: {earlier.created_utc:%d %B %Y %H:%M} UTC, {earlier.choice.model}, focus "
-            f"“{earlier.focus_note or 'not noted'}”. Where both are covered, rays differ by {size:.1f} um "
+            f"“{earlier.focus_note or 'not noted'}”. Where both are covered, rays differ by {size:.1f} µm "
             f"rms at z = {c.z_mm:.1f} mm.",
             f"A motion of the camera on the rig by ({shift[0]:+.3f}, {shift[1]:+.3f}, {shift[2]:+.3f}) mm "
-            f"and ({turn[0]:+.4f}, {turn[1]:+.4f}, {turn[2]:+.4f}) degrees leaves {left:.1f} um rms; of the "
+            f"and ({turn[0]:+.4f}, {turn[1]:+.4f}, {turn[2]:+.4f}) degrees leaves {left:.1f} µm rms; of the "
             f"pixels, {100 * c.explained_share:.0f} % are then within both calibrations' 95 % uncertainty. "
             "What is "
             "left is the lens's.",

@@ -316,9 +316,9 @@ def _timing(result: RunResult, figures: KeyFigures, panels: TimePanels) -> list[
     if len(stamps) > 2:
         off_us, periods = frame_intervals_us(result, figures)
         source = samples(axis.s(stamps[1:]), {"us": off_us, "periods": periods})
-        panel = panels.panel("interval, us", title="Frames: time between stamps, less whole frame periods")
+        panel = panels.panel("interval, µs", title="Frames: time between stamps, less whole frame periods")
         dots = panel.scatter("t", "us", source=source, color=OPTICAL, size=3.5)
-        tell(panel, dots, [("interval", "@periods{0} periods and @us{0.0} us"), ("time", "@t{0.0000} s")],
+        tell(panel, dots, [("interval", "@periods{0} periods and @us{0.0} µs"), ("time", "@t{0.0000} s")],
              along_time=False)  # fmt: skip
         made.append(panel)
     late_us = imu_lateness_us(result)
@@ -334,9 +334,9 @@ def _timing(result: RunResult, figures: KeyFigures, panels: TimePanels) -> list[
         source = samples(
             axis.s(fit.edges_ns), {"us": fit.residual_ns / 1000, "number": fit.index.astype(float)}
         )
-        panel = panels.panel("residual, us", title="Square wave: edge less fitted line")
+        panel = panels.panel("residual, µs", title="Square wave: edge less fitted line")
         dots = panel.scatter("t", "us", source=source, color=TRUTH, size=2.5)
-        tell(panel, dots, [("edge", "@number{0}"), ("residual", "@us{0.00} us"), ("time", "@t{0.0000} s")],
+        tell(panel, dots, [("edge", "@number{0}"), ("residual", "@us{0.00} µs"), ("time", "@t{0.0000} s")],
              along_time=False)  # fmt: skip
         missed_s = axis.s(fit.time_of_index(fit.missed_index))
         if len(missed_s):

@@ -84,7 +84,7 @@ def timing_chart(result: RunResult, figures: KeyFigures) -> Chart:
         if gap.any():
             frames.add(Signs(at_s[gap], off_us[gap], IMPACT, label="after dropped frames"))
         limit = max(20.0, 1.2 * float(np.abs(off_us).max()))
-        frames.y_limits, frames.y_label = (-limit, limit), "interval, us"
+        frames.y_limits, frames.y_label = (-limit, limit), "interval, µs"
     else:
         frames.note, frames.y_ticks = "fewer than three frames", False
     samples.title = "Inertial sensor: sample after its slot"
@@ -108,7 +108,7 @@ def timing_chart(result: RunResult, figures: KeyFigures) -> Chart:
         extra_s = axis.s(fit.edges_ns[fit.is_extra])
         if len(extra_s):
             edges.add(Signs(extra_s, np.zeros(len(extra_s)), IMPACT, label="extra edge"))
-        edges.y_label = "residual, us"
+        edges.y_label = "residual, µs"
     edges.x_label = axis.label
     return chart
 
@@ -198,7 +198,7 @@ def calibration_chart(calibration: CalibrationPicture, uv_px: FloatArray | None 
             enlarged = 28 / typical  # a typical one is 28 px of the picture
             (u, v), (du, dv) = on_target[known].T, enlarged * residual[known].T
             panel.add(Arrows(u, v, du, dv, OPTICAL))
-            panel.title = f"dots and their residuals, median {typical:.1f} um on the target"
+            panel.title = f"dots and their residuals, median {typical:.1f} µm on the target"
     if uv_px is not None:
         uv = uv_px.reshape(-1, 2)
         panel.add(Scatter(uv[:, 0], uv[:, 1], FUSED, 0.75, label="LEDs of this run"))

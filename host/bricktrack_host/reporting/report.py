@@ -179,7 +179,7 @@ def _origin_tables(result: RunResult) -> list[OriginTable]:
         c = m.camera
         gain = f"{c.analogue_gain:g}" if c.analogue_gain else "unknown"  # 0: imported, and nobody knows
         unit.append(("camera", f"{c.model}, {c.mode.name}, {c.mode.width} x {c.mode.height}, exposure "
-                     f"{c.exposure_us} us, gain {gain}, encoder {c.encoder}"))  # fmt: skip
+                     f"{c.exposure_us} µs, gain {gain}, encoder {c.encoder}"))  # fmt: skip
     unit += [
         (f"inertial sensor {i.name}", f"range {i.acc_range_g:g} g, {1e9 / i.period_ns:g} slots a second, "
          f"latency {i.latency_ns / 1e6:g} ms")

@@ -204,8 +204,8 @@ def _timing_words(result: RunResult, figures: KeyFigures) -> list[str]:
         )  # fmt: skip
         words.append(
             f"{fit.n_edges} edges of the square wave, {fit.missed_index.size} missed, "
-            f"{int(fit.is_extra.sum())} extra{rate}; residual {fit.residual_rms_ns / 1000:.1f} us rms, "
-            f"{fit.residual_max_ns / 1000:.1f} us at most."
+            f"{int(fit.is_extra.sum())} extra{rate}; residual {fit.residual_rms_ns / 1000:.1f} µs rms, "
+            f"{fit.residual_max_ns / 1000:.1f} µs at most."
         )
     return words
 
@@ -278,8 +278,8 @@ def _truth_section(result: RunResult, figures: KeyFigures, truth: TruthCompariso
     return section
 
 
-_UNITS = dict.fromkeys(("ms", "us", "ns", "s", "ppm", "um", "mm", "px", "deg")) | {
-    "hz": "Hz", "mps2": "m/s²", "radps": "rad/s", "dps": "deg/s",
+_UNITS = dict.fromkeys(("ms", "ns", "s", "ppm", "mm", "px", "deg")) | {
+    "us": "µs", "um": "µm", "hz": "Hz", "mps2": "m/s²", "radps": "rad/s", "dps": "deg/s",
 }  # fmt: skip
 _IN_FULL = {
     "acc_lag": "accelerometer behind gyroscope",

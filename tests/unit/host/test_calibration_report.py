@@ -85,7 +85,7 @@ def test_a_page_lists_what_was_found_of_the_rig(tmp_path):
 def test_the_verdict_warns_of_a_rig_that_the_pictures_contradict(turned):
     fitted, made = turned
     line, problems = verdict(gathered_evidence(fitted, made))
-    assert "um from the rays on average" in line
+    assert "µm from the rays on average" in line
     assert any(re.search(r"plane 2: turn about x by 0\.0[78]\d ± 0\.00\d", p) for p in problems)
 
 

@@ -64,7 +64,7 @@ def test_the_sample_is_calibrated_and_reported(fitted):
     assert calibration.sensor_mode.line_time_ns == pytest.approx(18903.5)
     # Dots are measured to about 0.02 px of 100 um at plane B.
     assert calibration.residuals[1].mean_um < 3.0
-    for words in ("plane A: calib_A_32x18.png", "mean residual, um", "Model: central", "of the picture"):
+    for words in ("plane A: calib_A_32x18.png", "mean residual, µm", "Model: central", "of the picture"):
         assert words in output
 
 

@@ -127,7 +127,7 @@ def test_a_surplus_at_the_end_may_be_allowed_and_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("stamps_us", "words"),
     [
-        (stamps()[1:], "the first stamp is 33327 us, not 0"),
+        (stamps()[1:], "the first stamp is 33327 µs, not 0"),
         (stamps(N - 1, dropped=(9,)), "leave out a frame after line 9"),
     ],
     ids=["first line missing", "a line in the middle missing"],

@@ -50,8 +50,8 @@ def test_milliseconds_are_exact_where_floats_are_not(write):
         ("0\nabc\n", "line 2.*'abc' is no number"),
         ("0\nnan\n", "line 2"),
         ("0\ninf\n", "line 2"),
-        ("0\n33\n67\n", "us apart.*--timestamps-unit"),
-        ("0.0\n33327.0\n66654.0\n", "us apart.*--timestamps-unit"),
+        ("0\n33\n67\n", "µs apart.*--timestamps-unit"),
+        ("0.0\n33327.0\n66654.0\n", "µs apart.*--timestamps-unit"),
     ],
 )
 def test_stamps_that_cannot_be_right_are_refused(write, text, words):

@@ -53,7 +53,7 @@ def test_boards_that_do_not_belong_together_are_refused():
     ):
         merge_boards([here, there])
     nearer = placed(BoardPose((5, 0, 107.0)))
-    with pytest.raises(CalibrationError, match="2 boards disagree by .* um where they overlap"):
+    with pytest.raises(CalibrationError, match="2 boards disagree by .* µm where they overlap"):
         merge_boards([placed(BoardPose((-10, 0, 110))), nearer])
 
 

@@ -95,8 +95,8 @@ def merge_boards(boards: Sequence[DotObservations]) -> MergedBoards:
     rms = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
     if rms > MAX_MISFIT_STEPS * step:
         raise CalibrationError(
-            f"{len(boards)} boards disagree by {1e3 * rms:.0f} um where they overlap; expected less than "
-            f"{1e3 * MAX_MISFIT_STEPS * step:.0f} um: was a board moved out of the plane, or bent?"
+            f"{len(boards)} boards disagree by {1e3 * rms:.0f} µm where they overlap; expected less than "
+            f"{1e3 * MAX_MISFIT_STEPS * step:.0f} µm: was a board moved out of the plane, or bent?"
         )
     sizes = [np.broadcast_to(np.asarray(b.size, dtype=np.float64), len(b)) for b in boards]
     merged = replace(

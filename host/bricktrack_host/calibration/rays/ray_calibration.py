@@ -260,7 +260,7 @@ def choose_model(
     chosen = other if rejected and better else central
     test = f"test of a common centre p = {p[kind]:.2g}"
     errors = (
-        f"expected error {central.error.expected_um:.2f} um central, {other.error.expected_um:.2f} um {kind}"
+        f"expected error {central.error.expected_um:.2f} µm central, {other.error.expected_um:.2f} µm {kind}"
     )
     if chosen is other:
         reason = f"{kind}: the rays do not meet in one point ({test}; {errors})"
