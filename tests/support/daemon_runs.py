@@ -236,20 +236,24 @@ def _sample(
     *,
     on_camera: bool,
 ) -> ImuTrack:
-    stream = 2 if on_camera else 1
-    sensors = ImuSensors(world, on_camera=on_camera, stream=stream)
-    chip = Bno055Chip(bytes(16), sensors.measure, period_s=chip_period_s(world.settings, stream))
-    on_ns = EPOCH_NS - 2_000_000_000
-    range_code = {2: 0, 4: 1, 8: 2, 16: 3}[acc_range_g]
-    for register, value in (
-        (0x07, 1),
-        (0x08, _ACC_CONFIG_16G_62HZ & ~3 | range_code),
-        (0x07, 0),
-        (0x3D, _AMG),
-    ):
-        chip.write(register, bytes([value]), on_ns)
     t0_ns = EPOCH_NS - 400_000_000 + round(rng.uniform(0, _PERIOD_NS))
-    description = ImuDescription(
+    description = imu_description(t0_ns, acc_range_g=acc_range_g, on_camera=on_camera)
+    n_slots = int((duration_s + 0.8) * 100)
+    on_ns = EPOCH_NS - 2_000_000_000
+    records = read_chip(world, description, rng, n_slots, on_ns=on_ns, late_share=late_share)
+    samples = decode_imu(description, records)
+    return ImuTrack(
+        t_ns=samples.t_ns + stamp_offset_ns,
+        acc_mps2=samples.acc_mps2,
+        gyro_radps=samples.gyro_radps,
+        flags=samples.flags,
+        acc_range_mps2=acc_range_g * STANDARD_GRAVITY_MPS2,
+    )
+
+
+def imu_description(t0_ns: int, *, acc_range_g: int = 16, on_camera: bool = False) -> ImuDescription:
+    """Return what a unit says of a chip whose grid begins at this instant."""
+    return ImuDescription(
         name="camera" if on_camera else "brick",
         chip_id="",
         bus="sim",
@@ -260,9 +264,33 @@ def _sample(
         period_ns=_PERIOD_NS,
         t0_ns=t0_ns,
     )
+
+
+def read_chip(
+    world: SimWorld,
+    description: ImuDescription,
+    rng: np.random.Generator,
+    n_slots: int,
+    *,
+    on_ns: int,
+    late_share: float = 0.0,
+) -> list[ImuRecord]:
+    """Return the bursts that a unit reads, slot by slot, from a simulated chip switched on at an instant."""
+    on_camera = description.name == "camera"
+    stream, t0_ns = 2 if on_camera else 1, description.t0_ns
+    sensors = ImuSensors(world, on_camera=on_camera, stream=stream)
+    chip = Bno055Chip(bytes(16), sensors.measure, period_s=chip_period_s(world.settings, stream))
+    range_code = {2: 0, 4: 1, 8: 2, 16: 3}[round(description.acc_range_g)]
+    for register, value in (
+        (0x07, 1),
+        (0x08, _ACC_CONFIG_16G_62HZ & ~3 | range_code),
+        (0x07, 0),
+        (0x3D, _AMG),
+    ):
+        chip.write(register, bytes([value]), on_ns)
     records: list[ImuRecord] = []
     late = np.random.default_rng([world.settings.seed, 81 if on_camera else 78])
-    for slot in range(int((duration_s + 0.8) * 100)):
+    for slot in range(n_slots):
         # A wake-up is late by some 30 us, now and then by more; a burst takes 1.3 ms, give or take.
         due = t0_ns + slot * _PERIOD_NS
         if records and due < records[-1].t_after_ns:
@@ -272,11 +300,4 @@ def _sample(
         after = before + round(1.3e6 + abs(rng.normal(0, 2e4)))
         data = chip.read(FIRST_REGISTER, N_DATA_BYTES, (before + after) // 2)
         records.append(ImuRecord(slot, before, after, data, 0, None))
-    samples = decode_imu(description, records)
-    return ImuTrack(
-        t_ns=samples.t_ns + stamp_offset_ns,
-        acc_mps2=samples.acc_mps2,
-        gyro_radps=samples.gyro_radps,
-        flags=samples.flags,
-        acc_range_mps2=acc_range_g * STANDARD_GRAVITY_MPS2,
-    )
+    return records
