@@ -28,6 +28,7 @@ from bricktrack_host.tracking.pose.frame_motion import (
     motion_doubt_px2,
     motion_to_leds,
 )
+from bricktrack_host.tracking.pose.lone_turns import on_their_neighbours_course
 from bricktrack_host.tracking.pose.p3p import ray_centre_mm
 from bricktrack_host.tracking.pose.prsoi import PrsoiForm, prsoi_starts
 from bricktrack_host.tracking.pose.refine import MIN_LEDS, LedMotion, RefinedPoses, refine_poses
@@ -98,6 +99,8 @@ def solve_poses(
     collar_mm = collar_of(brick_model)
     cov = observations.cov_px2.copy()
 
+    known_motion = motion
+    is_given = known_motion is not None or not rolling_shutter
     centre_mm = ray_centre_mm(ray_model)
 
     def fit(
@@ -109,14 +112,23 @@ def solve_poses(
                 uv[rows], cov[rows], R, t, ray_model, brick_model, collar_mm=collar_mm, motion=within
             )
 
+        def fit_on_course(rows: IntArray, R: FloatArray, t: FloatArray) -> RefinedPoses:
+            within = motion
+            if motion is not None and not is_given:
+                within = _no_surer(motion_to_leds(t_ns, led_t_ns, R, t), motion)
+            return refine_poses(
+                uv[rows], cov[rows], R[rows], t[rows], ray_model, brick_model, collar_mm=collar_mm,
+                motion=None if within is None else rows_of(within, rows),
+            )  # fmt: skip
+
         poses = fit_frames(np.arange(n), R, t)
-        return better_of_twins(poses, uv, t_ns, fit_frames, centre_mm, brick_model)
+        poses, is_twofold = better_of_twins(poses, uv, t_ns, fit_frames, centre_mm, brick_model)
+        poses, is_open = on_their_neighbours_course(poses, uv, t_ns, fit_on_course)
+        return poses, is_twofold | is_open
 
     first = first or start_poses(observations, ray_model, brick_model, form=form)
     flags[first.is_ambiguous] |= PoseFlag.AMBIGUOUS
     uv, R, t_mm = first.uv_px, first.R_camera_brick, first.t_camera_brick_mm
-    known_motion = motion
-    is_given = known_motion is not None or not rolling_shutter
     of_instants: LedMotion | None = None
     torn, twist_doubt = np.zeros(n, dtype=np.bool_), np.zeros((n, 6))
     for _ in range(_PASSES):
@@ -171,6 +183,13 @@ def solve_poses(
     of_leds = standing_share(track.residual_px) * misfit * poses.by_centroids
     of_profile = poses.by_profile[:, :, None] * poses.by_profile[:, None, :]
     return replace(track, shared_covariance=of_leds + of_profile)
+
+
+def _no_surer(motion: LedMotion, than: LedMotion) -> LedMotion:
+    """Return a motion no surer than another."""
+    if motion.twist_sd is None or than.twist_sd is None:
+        return motion
+    return replace(motion, twist_sd=np.maximum(motion.twist_sd, than.twist_sd))
 
 
 def _no_less_sure(motion: LedMotion, of_instants: LedMotion | None) -> LedMotion:

@@ -5,7 +5,8 @@ from identity_frames import fitted_brick, tracked
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.evaluation.paper_brick import paper_brick
 from bricktrack_host.evaluation.true_camera import TrueCamera
-from bricktrack_host.tracking.identity.identity_motion import poses_between, turn_between, unknown_motion
+from bricktrack_host.tracking.identity.identity_motion import unknown_motion
+from bricktrack_host.tracking.pose.neighbour_poses import poses_between, turn_between
 
 STEP_NS = 33_327_000
 

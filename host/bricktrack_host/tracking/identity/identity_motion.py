@@ -12,15 +12,11 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.rotations import matrix_from_rvec
-from bricktrack_host.tracking.identity.neighbour_kernel import fill_between
 from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracking.pose.frame_motion import UNKNOWN_TWIST_SD, motion_to_leds
+from bricktrack_host.tracking.pose.neighbour_poses import poses_between
 from bricktrack_host.tracking.pose.refine import LedMotion
-from bricktrack_host.tracking.pose.turn_kernel import angles_between
-
-_MAX_FILLED = 2
-"""Frames without a pose, one after the other, that their neighbours' spline bridges."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,23 +103,3 @@ def places_px(
     t_led_mm = motion.t_camera_brick_mm[frames][:, None] + motion.within.shift_camera_mm[frames]
     moved, _ = predict_brick(R_led, t_led_mm, ray_model, brick_model, collar_mm=collar_mm)
     return np.where(moved.facing[..., None] > 0, moved.uv_px, np.nan)
-
-
-def poses_between(stamps_ns: IntArray, R: FloatArray, t_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return where each frame's neighbours, two on either side, show it by a cubic; NaN where they are far.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n,)
-    R, t_mm : ndarray, shapes (n, 3, 3) and (n, 3)
-        NaN where there is no pose.
-    """
-    out_R, out_t = np.full(R.shape, np.nan), np.full(t_mm.shape, np.nan)
-    valid = np.flatnonzero(all_finite(R, 2) & all_finite(t_mm))
-    fill_between(stamps_ns, valid, R, t_mm, _MAX_FILLED, out_R, out_t)
-    return out_R, out_t
-
-
-def turn_between(R: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the angle between attitudes (n, 3, 3), rad; NaN where one is not known."""
-    return angles_between(np.ascontiguousarray(R), np.ascontiguousarray(other))

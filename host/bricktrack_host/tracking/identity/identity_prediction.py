@@ -12,11 +12,12 @@ from scipy.ndimage import percentile_filter
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
-from bricktrack_host.tracking.identity.identity_motion import RunMotion, poses_between, turn_between
+from bricktrack_host.tracking.identity.identity_motion import RunMotion
 from bricktrack_host.tracking.identity.run_identities import RunIdentities
 from bricktrack_host.tracking.identity.verification import motion_of
 from bricktrack_host.tracking.led_model.led_profile import predict_brick
 from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.neighbour_poses import poses_between, turn_between
 
 _NEAR_FRAMES, _USUAL_PERCENT = 31, 90
 _CONTRADICTED = 25.0  # chi-square of six, one in 3000: an impact, and the neighbours do not show the frame

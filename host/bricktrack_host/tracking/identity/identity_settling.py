@@ -13,7 +13,6 @@ from bricktrack_host.tracking.identity.assigned_lights import MIN_INLIERS, LedLi
 from bricktrack_host.tracking.identity.identity_motion import (
     RunMotion,
     places_px,
-    turn_between,
     unknown_motion,
 )
 from bricktrack_host.tracking.identity.identity_newcomers import leave_out_fleeting, leave_out_newcomers
@@ -28,6 +27,7 @@ from bricktrack_host.tracking.identity.run_identities import (
 )
 from bricktrack_host.tracking.identity.verification import Verified, motion_of
 from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.neighbour_poses import turn_between
 from bricktrack_host.tracking.pose.refine import LedMotion
 
 _LEAST_GATE_PX = 0.5  # what calibration and profile may leave, beside centroid noise

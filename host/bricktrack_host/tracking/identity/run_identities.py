@@ -9,16 +9,12 @@ from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_host.tracking.identity.assigned_lights import LedLights, RunLights
-from bricktrack_host.tracking.identity.identity_motion import (
-    RunMotion,
-    poses_between,
-    run_motion,
-    turn_between,
-)
+from bricktrack_host.tracking.identity.identity_motion import RunMotion, run_motion
 from bricktrack_host.tracking.identity.verification import Verified, identity_gate_px, in_line, verify
 from bricktrack_host.tracking.led_model.led_profile import LedPrediction, predict_brick
 from bricktrack_host.tracking.pictures.segment import Blobs
 from bricktrack_host.tracking.pose.finite import all_finite
+from bricktrack_host.tracking.pose.neighbour_poses import poses_between, turn_between
 from bricktrack_host.tracking.pose.refine import LedMotion
 
 SUSPECT, NEAR_FRAMES = 3.0, 9
