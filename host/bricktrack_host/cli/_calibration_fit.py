@@ -207,10 +207,10 @@ def _print(fitted: RayCalibration, *, names: list[str], simulated: bool) -> None
     for found in fitted.fit.rig:
         scale, unit = (np.rad2deg(1.0), "degrees") if found.unit == "rad" else (1.0, "mm")
         told = "" if found.is_observed else "; the pictures do not tell, the tolerance stands"
-        console.print(f"{found.name}: {scale * found.value:+.4f} +- {scale * found.sd:.4f} {unit}{told}")
+        console.print(f"{found.name}: {scale * found.value:+.4f} ± {scale * found.sd:.4f} {unit}{told}")
     for doubt in fitted.doubts:
         console.print(
-            f"Warning: the pictures contradict the rig: {doubt.name} by {np.rad2deg(doubt.value):+.3f} +- "
+            f"Warning: the pictures contradict the rig: {doubt.name} by {np.rad2deg(doubt.value):+.3f} ± "
             f"{np.rad2deg(doubt.sd):.3f} degrees. Check the board, or give --turn-tolerance-deg.",
             style="yellow",
         )

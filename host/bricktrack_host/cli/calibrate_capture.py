@@ -310,7 +310,7 @@ def _report(
             "light of the dots",
             f"{100 * check.light:.0f} % of full, {100 * check.contrast:.0f} % over the background",
         ),
-        ("tilt", f"{check.pose.tilt_deg:.2f} +- {check.pose.tilt_sd_deg:.2f} degrees"),
+        ("tilt", f"{check.pose.tilt_deg:.2f} ± {check.pose.tilt_sd_deg:.2f} degrees"),
         ("turn", f"{check.pose.turn_deg:.1f} degrees"),
     ):
         table.add_row(*row)

@@ -188,7 +188,7 @@ def _report(
     table.add_row("max residual, µm", *(f"{p.max_um:.2f}" for p in pages))
     table.add_row("stated rms, µm", *(f"{p.stated_um:.2f}" for p in pages))
     table.add_row("residual by stated", *(f"{p.ratio:.2f}" for p in pages))
-    table.add_row("depth found, mm", *(f"{p.depth_mm:.3f} +- {p.depth_sd_mm:.3f}" for p in pages))
+    table.add_row("depth found, mm", *(f"{p.depth_mm:.3f} ± {p.depth_sd_mm:.3f}" for p in pages))
     table.add_row("depth given, mm", *("" if z is None else f"{z:.3f}" for z in depths))
     table.add_row("tilt, degrees", *(f"{p.tilt_deg:.2f}" for p in pages))
     table.add_row("dots that the calibration covers", *(f"{100 * p.covered:.0f} %" for p in pages))

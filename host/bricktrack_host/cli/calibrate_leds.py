@@ -152,7 +152,7 @@ def _show_collar(fit: "CollarFit", brick: "BrickModel", simulated: str) -> None:
     _show_left_out(fit.left_out_px, brick)
     what = "collar" if fit.collar_mm >= 0 else "no collar, and a dome higher than half a sphere by"
     out.print(
-        f"{what}: {abs(fit.collar_mm):.3f} +- {fit.sd_mm:.3f} mm, from {fit.n_leds} LEDs in {fit.n_frames} "
+        f"{what}: {abs(fit.collar_mm):.3f} ± {fit.sd_mm:.3f} mm, from {fit.n_leds} LEDs in {fit.n_frames} "
         f"frames{simulated}; the light's middle is then known to {100 * fit.shift_sd_per_radius:.2f} % of "
         "the radius"
     )
@@ -169,14 +169,14 @@ def _show_positions(fit: "PositionsFit", brick: "BrickModel", simulated: str) ->
 
     _show_left_out(fit.left_out_px, brick)
     table = Table(
-        title=f"LED positions from {fit.n_frames} frames{simulated}, mm: change from the layout, +- sd"
+        title=f"LED positions from {fit.n_frames} frames{simulated}, mm: change from the layout, ± sd"
     )
     for name in ("LED", "x", "y", "z"):
         table.add_column(name, justify="left" if name == "LED" else "right")
     change = fit.positions_mm - brick.led_positions_mm
     table.add_row(brick.led_names[0], "origin", "", "")
     for k in range(1, brick.n_leds):
-        told = (f"{m:+.3f} +- {s:.3f}" for m, s in zip(change[k], fit.sd_mm[k], strict=True))
+        told = (f"{m:+.3f} ± {s:.3f}" for m, s in zip(change[k], fit.sd_mm[k], strict=True))
         table.add_row(brick.led_names[k], *(("left out", "", "") if fit.left_out_px[k] > 0 else told))
     out.print(table)
     odd = ", ".join(name for name, px in zip(brick.led_names, fit.odd_px, strict=True) if px > 0)

@@ -56,7 +56,7 @@ def words_on_camera_step(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAl
     sd_deg = float(np.rad2deg(np.sqrt(np.trace(step.covariance))))
     return [
         f"the camera was knocked, or the IMU slipped on the brick, at frame {frame} ({at_s:.2f} s after the "
-        f"first): from there on attitudes are {size_deg:.2f} +- {sd_deg:.2f} deg beside the gyro's. "
+        f"first): from there on attitudes are {size_deg:.2f} ± {sd_deg:.2f} deg beside the gyro's. "
         "Displacements from rest hold the knock from there on, its shift too. Fasten both and record again, "
         "or use the frames before it"
     ]

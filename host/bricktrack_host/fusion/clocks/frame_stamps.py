@@ -99,7 +99,7 @@ def check_stamps(
             is_contradicted, spread_ns = True, abs(change.change_s) * 1e9
             problems.append(
                 "the offset of IMU and camera changes by "
-                f"{change.change_s * 1e3:+.1f} +- {change.sd_s * 1e3:.1g} ms from the first half of the run "
+                f"{change.change_s * 1e3:+.1f} ± {change.sd_s * 1e3:.1g} ms from the first half of the run "
                 "to the second, by the rotations that both saw: the stamps of one of them step or drift. "
                 "Poses are as unsure as the motion in that time"
             )
@@ -186,7 +186,7 @@ def _step_words(
     doubt = "Poses of the whole run are as unsure as the motion in that time"
     if change is None:
         return f"{found}. The motion does not tell whether the camera paused or the stamps are wrong. {doubt}"
-    size = f"{change.change_s * 1e3:+.1f} +- {change.sd_s * 1e3:.1g} ms"
+    size = f"{change.change_s * 1e3:+.1f} ± {change.sd_s * 1e3:.1g} ms"
     moved = f"offset of IMU and camera changes there by {size}"
     if verdict == "paused":
         return f"{found}. The {moved}: the camera paused, and the stamps are believed"

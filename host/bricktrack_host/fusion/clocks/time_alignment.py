@@ -275,7 +275,7 @@ def align_times(
     if disagrees:
         reason = (
             f"the motion puts the offset at {best.offset_s * 1e3:.2f} ms, the stamps at "
-            f"{prior_s * 1e3:.2f} +- {prior_sd_ns * 1e-6:.2g} ms"
+            f"{prior_s * 1e3:.2f} ± {prior_sd_ns * 1e-6:.2g} ms"
         )
         logger.warning("%s", reason)
     return TimeAlignment(
