@@ -5,9 +5,10 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from bricktrack_common.errors import BricktrackError
 from bricktrack_device.network import keys_cli
@@ -18,8 +19,33 @@ if TYPE_CHECKING:
     from bricktrack_device.interfaces import Rig
     from bricktrack_device.timing.result_file import Result
 
+
+class _Group(TyperGroup):
+    """A group whose help shows no type for flags, nor does that of the commands below it."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        _untype_flags(self)
+
+
+def _untype_flags(command: Any) -> None:
+    listed = command.get_params
+
+    def get_params(context: Any) -> list[Any]:
+        parameters: list[Any] = listed(context)
+        for parameter in parameters:
+            if getattr(parameter, "is_flag", False):
+                parameter.metavar = ""
+        return parameters
+
+    command.get_params = get_params
+    for child in getattr(command, "commands", {}).values():
+        _untype_flags(child)
+
+
 app = typer.Typer(
     name="bricktrackd",
+    cls=_Group,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",

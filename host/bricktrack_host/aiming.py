@@ -199,6 +199,7 @@ def draw(luma: NDArray[np.uint8], aim: Aim, *, title: str) -> NDArray[np.uint8]:
         cv2.rectangle(picture, *box, _GUIDE, thick)
         middle_u, middle_v = (box[0][0] + box[1][0]) / 2, (box[0][1] + box[1][1]) / 2
         step = 26 * size
+        beside_u = middle_u + 75 * size
         for words, start, end, at in (
             (f"{left:.0f} px", (0, middle_v), (left, middle_v), (left / 2, middle_v - step)),
             (
@@ -207,12 +208,12 @@ def draw(luma: NDArray[np.uint8], aim: Aim, *, title: str) -> NDArray[np.uint8]:
                 (columns, middle_v),
                 (columns - right / 2, middle_v - step),
             ),
-            (f"{top:.0f} px", (middle_u, 0), (middle_u, top), (middle_u + step, top / 2)),
+            (f"{top:.0f} px", (middle_u, 0), (middle_u, top), (beside_u, top / 2)),
             (
                 f"{bottom:.0f} px",
                 (middle_u, box[1][1]),
                 (middle_u, rows),
-                (middle_u + step, rows - bottom / 2),
+                (beside_u, rows - bottom / 2),
             ),
         ):
             ends = [(int(p[0]), int(p[1])) for p in (start, end)]

@@ -14,7 +14,7 @@ app = typer.Typer(
     name="keys", help="The unit's own key, and the hosts that may speak to it.", no_args_is_help=True
 )
 
-FolderOption = Annotated[Path, typer.Option("--folder", help="The folder of keys, as in [server] keys.")]
+FolderOption = Annotated[Path, typer.Option("--folder", help="The folder of keys, as in \\[server] keys.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
 
 

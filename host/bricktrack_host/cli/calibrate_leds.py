@@ -80,7 +80,8 @@ def leds(
     with stage_bar(run.name) as bar:
         observations, problems = observe_run(recording, rays, brick, progress=bar)
     for problem in problems:
-        out.print(problem, style="yellow", markup=False)
+        if problem not in recording.problems:  # those were said when it was read
+            out.print(problem, style="yellow", markup=False, soft_wrap=True)
     simulated = " (simulated)" if recording.manifest.simulated else ""
     text = layout.read_text(encoding="utf-8").rstrip()
     places: PositionsFit | None = None

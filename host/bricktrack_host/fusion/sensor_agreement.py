@@ -37,7 +37,7 @@ def require_agreement(run: Run, settings: FusionSettings) -> None:
     zeroed = "" if run.camera.kind == "imu" else f", or about {settings.gravity_mps2:.1f} if it was zeroed"
     raise TrackingError(
         f"turned into the same axes, the accelerometers of the moving camera and of the brick differ by "
-        f"{difference:.1f} m/s^2; expected less than {_MOST_BETWEEN_BIASES_MPS2:g}{zeroed}. Check `rotation` "
+        f"{difference:.1f} m/s²; expected less than {_MOST_BETWEEN_BIASES_MPS2:g}{zeroed}. Check `rotation` "
         f"in [unit.{entry}] of the fleet file and the axes of the IMU in the brick's layout file"
     )
 

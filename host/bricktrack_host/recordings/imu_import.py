@@ -66,7 +66,7 @@ def import_imu(
     """
     period_ns, t0_ns, slots, worst_ns = _fit_grid(imu.t_ns)
     acc_lsb, acc_words, acc_note = _to_words(
-        imu.acc_mps2, _ACC_LSB_PER_MPS2, acc_range_g * STANDARD_GRAVITY_MPS2, "accelerometer", "m/s^2",
+        imu.acc_mps2, _ACC_LSB_PER_MPS2, acc_range_g * STANDARD_GRAVITY_MPS2, "accelerometer", "m/s²",
         f"give its range with --imu-acc-range-g (it is {acc_range_g:g} now)",
     )  # fmt: skip
     gyro_lsb, gyro_words, gyro_note = _to_words(

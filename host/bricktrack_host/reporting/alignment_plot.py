@@ -12,6 +12,7 @@ from bricktrack_host.reporting.plots import FUSED, IMPACT, INK, OPTICAL, style
 
 _NEAR_MS = 60.0
 _SHOWN_S = 3.0
+_SHOWN_SHARE = 0.3  # of a short run, so that it is closer than the whole
 
 
 def save_alignment_plot(report: AlignmentReport, path: Path, *, title: str) -> None:
@@ -22,16 +23,17 @@ def save_alignment_plot(report: AlignmentReport, path: Path, *, title: str) -> N
         rows = figure.subplots(2, 2, width_ratios=[1.5, 1.0])
         whole, close, over, near = rows[0, 0], rows[1, 0], rows[0, 1], rows[1, 1]
         optical, gyro = np.rad2deg(report.optical_radps), np.rad2deg(report.gyro_radps)
-        start = _liveliest(report.t_s, report.optical_radps)
+        start, end = _liveliest(report.t_s, report.optical_radps)
         for ax in (whole, close):
             ax.plot(*_broken(report.t_s, gyro), color=FUSED, lw=1.0, label="gyro, at the offset found")
             ax.plot(report.t_s, optical, "o", color=OPTICAL, ms=2.2, label="camera, frame to frame")
             ax.set_ylabel("angular speed, deg/s")
             ax.set_xlabel("time since the first pose, s")
         whole.set_title("Both angular speeds")
+        whole.set_ylim(top=1.3 * whole.get_ylim()[1])  # room for the legend
         whole.legend(loc="upper right")
         close.set_title("Where it turned most")
-        close.set_xlim(start, start + _SHOWN_S)
+        close.set_xlim(start, end)
         found_ms = report.alignment.offset_ns / 1e6
         lags_ms = report.correlation.lags_s * 1e3
         for ax in (over, near):
@@ -60,8 +62,10 @@ def _broken(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray
     return np.insert(t_s, gap, np.nan), np.insert(values, gap, np.nan)
 
 
-def _liveliest(t_s: FloatArray, speed: FloatArray) -> float:
-    """Return where the stretch shown close begins: about the greatest speed."""
-    if len(t_s) == 0:
-        return 0.0
-    return float(np.clip(t_s[int(np.argmax(speed))] - _SHOWN_S / 2, 0.0, max(t_s[-1] - _SHOWN_S, 0.0)))
+def _liveliest(t_s: FloatArray, speed: FloatArray) -> tuple[float, float]:
+    """Return where the stretch shown close begins and ends, s: about the greatest speed."""
+    if len(t_s) < 2:
+        return 0.0, _SHOWN_S
+    length_s = min(_SHOWN_S, _SHOWN_SHARE * float(t_s[-1]))
+    start = float(np.clip(t_s[int(np.argmax(speed))] - length_s / 2, 0.0, t_s[-1] - length_s))
+    return start, start + length_s

@@ -35,6 +35,12 @@ def test_help_has_an_example(command: str) -> None:
     assert done.returncode == 0 and f"bricktrackd {command}" in done.stdout.split("Example", 1)[1]
 
 
+@pytest.mark.parametrize("command", [(), ("run",), ("keys",), ("keys", "create")])
+def test_help_says_no_type_of_flags(command: tuple[str, ...]) -> None:
+    done = bricktrackd(*command, "--help")
+    assert done.returncode == 0 and "--help" in done.stdout and "bool" not in done.stdout.lower()
+
+
 def test_the_version_is_the_host_s_too() -> None:
     done = bricktrackd("--version")
     assert (done.returncode, done.stdout) == (0, f"bricktrackd {importlib.metadata.version('bricktrack')}\n")

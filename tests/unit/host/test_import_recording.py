@@ -232,7 +232,7 @@ def test_a_bno055s_steps_are_kept_exactly():
     np.testing.assert_allclose(np.rad2deg(samples.gyro_radps), imu.gyro_dps, rtol=0, atol=1e-12)
     assert samples.t_ns.tolist() == imu.t_ns.tolist()
     assert not samples.flags.any()
-    assert made.notes[1] == "accelerometer: kept exactly, in steps of 1/100 m/s^2"
+    assert made.notes[1] == "accelerometer: kept exactly, in steps of 1/100 m/s²"
 
 
 def test_finer_data_get_the_finest_scale_that_fits_and_it_is_said():
@@ -243,7 +243,7 @@ def test_finer_data_get_the_finest_scale_that_fits_and_it_is_said():
     assert (made.description.acc_lsb_per_mps2, made.description.gyro_lsb_per_dps) == (2048, 256)
     np.testing.assert_allclose(samples.acc_mps2, acc, rtol=0, atol=0.5 / 2048 * 1.001)
     np.testing.assert_allclose(np.rad2deg(samples.gyro_radps), gyro, rtol=0, atol=0.5 / 256 * 1.001)
-    assert "rounded to steps of 1/2048 m/s^2" in made.notes[1]
+    assert "rounded to steps of 1/2048 m/s²" in made.notes[1]
 
 
 def test_missing_samples_become_gaps_at_their_own_slots():
