@@ -19,6 +19,8 @@ from bricktrack_device.capture.recording import Recording
 from bricktrack_device.capture.room import memory_available_bytes
 from bricktrack_device.capture.saving import build_manifest, streams
 from bricktrack_device.config import DeviceConfig
+from bricktrack_device.interfaces import EncodedPacket
+from bricktrack_device.storage.folder_lock import FolderLock
 from bricktrack_device.storage.recovery import recover_runs, waiting_copies
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME
@@ -72,7 +74,9 @@ class BlackBox:
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
         self._run: Path | None = None
+        self._lock: FolderLock | None = None
         self._n_packets = 0
+        self._first: list[EncodedPacket] = []
         self._due_s = 0.0
 
     @property
@@ -82,12 +86,14 @@ class BlackBox:
 
     def bring_in(self, store: RunStore) -> None:
         """Put on the card what a daemon left that was killed; see `storage.recovery`."""
+        self._let_go()
         if waiting_copies(self.folder):
             recover_runs(store, self.folder)
 
     def begin(self, run_id: str, video_bytes: int) -> None:
         """Copy this run from now on, if there is room for it in memory."""
-        self._run, self._n_packets, self._due_s = None, 0, 0.0
+        self._let_go()
+        self._n_packets, self._due_s = 0, 0.0
         if self.folder is None:
             return
         try:
@@ -96,6 +102,7 @@ class BlackBox:
             run = self.folder / run_id
             if not problem:
                 run.mkdir()
+                self._lock = FolderLock(run)
         except OSError as e:
             problem = f"{self.folder}: {e.strerror or e}"
         if problem:
@@ -127,11 +134,23 @@ class BlackBox:
 
     def forget(self) -> None:
         """Do away with the copy: the run is on the card, or there is no room for both."""
-        run, self._run = self._run, None
-        if run is not None:
-            shutil.rmtree(run, ignore_errors=True)
+        if self._run is not None:
+            shutil.rmtree(self._run, ignore_errors=True)
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Write no more to the copy that there is; another daemon may have it from now on."""
+        lock, self._run, self._lock = self._lock, None, None
+        if lock is not None:
+            lock.release()
 
     def _write(self, run: Path, recording: Recording) -> None:
+        packets = [] if recording.video is None else recording.video.packets
+        if self._n_packets and packets[:1] != self._first:
+            # Cut from another keyframe on, as before the run's window had begun: the video begins anew, or
+            # its pictures would not be where the frames' file says.
+            (run / VIDEO_NAME).unlink()
+            self._n_packets = 0
         _replace(run / DRAFT_NAME, dump_json(build_manifest(recording)))
         for name, fill in streams(recording):
             if name == VIDEO_NAME:
@@ -139,14 +158,14 @@ class BlackBox:
             contents = BytesIO()
             fill(contents)
             _replace(run / name, contents.getvalue())
-        if recording.video is not None:
-            new = [p.data for p in recording.video.packets[self._n_packets :]]
+        if packets:
+            new = [p.data for p in packets[self._n_packets :]]
             # With a fixed quantiser, or in noise, a video grows beyond what its bit rate promised.
             if shutil.disk_usage(run).free - sum(map(len, new)) < _OTHERS_BYTES:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             with (run / VIDEO_NAME).open("ab") as file:
                 file.writelines(new)
-            self._n_packets += len(new)
+            self._n_packets, self._first = self._n_packets + len(new), packets[:1]
 
 
 def _replace(path: Path, data: bytes) -> None:

@@ -37,6 +37,7 @@ from bricktrack_common.run_manifest import (
 )
 from bricktrack_common.typed_data import dump_json
 from bricktrack_device.storage.disk import storage_error
+from bricktrack_device.storage.folder_lock import FolderLock
 from bricktrack_device.storage.run_store import RunStore
 from bricktrack_device.storage.run_writer import DRAFT_NAME, PARTIAL_SUFFIX
 
@@ -109,13 +110,33 @@ def waiting_copies(black_box: Path | None) -> list[Path]:
 def _bring_in(copy: Path, store: RunStore) -> bool:
     """Put a run that a killed daemon left in memory on the card, as one whose saving was cut off.
 
-    The copy goes when the card has it all; what the daemon itself had saved whole is the better one. Tell
-    whether that is so.
+    The copy goes when the card has it all; what the daemon itself had saved whole is the better one. One of
+    another unit, or of a daemon that is still at work, is not ours to take. Tell whether nothing is left to
+    be done.
     """
     run_id = copy.name
     if not is_run_id(run_id) or not copy.is_dir():
         logger.warning("%s: not a run folder's name; left alone", copy)
         return True
+    if not store.is_own(run_id):
+        logger.warning("%s: is of another unit than %s; left alone", copy, store.unit)
+        return True
+    try:
+        lock = FolderLock(copy)
+    except BlockingIOError:
+        logger.warning("%s: another bricktrackd is at work on it; left alone", copy)
+        return True
+    except OSError as e:
+        logger.warning("%s: cannot be had now: %s; kept in memory", copy, e.strerror or e)
+        return False
+    try:
+        return _put_on_card(copy, run_id, store)
+    finally:
+        lock.release()
+
+
+def _put_on_card(copy: Path, run_id: str, store: RunStore) -> bool:
+    """Copy what is in memory beside its final name, and do away with it; tell whether that worked."""
     unfinished = store.runs / (run_id + PARTIAL_SUFFIX)
     if not (store.runs / run_id).exists() and not _is_whole(unfinished):
         try:

@@ -13,7 +13,6 @@ A run exists when its manifest parses. Nothing is deleted but by `RunStore.delet
 """
 
 import errno
-import fcntl
 import logging
 import os
 import re
@@ -21,7 +20,7 @@ import shutil
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TextIO
+from typing import Literal
 
 import msgspec
 
@@ -37,6 +36,7 @@ from bricktrack_common.wire_messages import FileSummary, RunDescription, RunSumm
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.storage.confirmations import Confirmations
 from bricktrack_device.storage.disk import Disk, storage_error
+from bricktrack_device.storage.folder_lock import FolderLock
 from bricktrack_device.storage.open_files import OpenFiles
 from bricktrack_device.storage.run_writer import PARTIAL_SUFFIX, RunWriter
 
@@ -68,6 +68,13 @@ class RunStore:
         What writes to the card.
     boot_id : str or None
         The kernel's, which tells the boots of one unit apart; read if not given.
+    may_be_read_only : bool
+        Whether what is there may be served though nothing can be written.
+
+    Attributes
+    ----------
+    problem : str
+        Why nothing could be written at the beginning, in words; ``""`` where it could.
 
     Raises
     ------
@@ -76,28 +83,45 @@ class RunStore:
     """
 
     def __init__(
-        self, folder: Path, unit: str, *, disk: Disk | None = None, boot_id: str | None = None
+        self,
+        folder: Path,
+        unit: str,
+        *,
+        disk: Disk | None = None,
+        boot_id: str | None = None,
+        may_be_read_only: bool = False,
     ) -> None:
         self.folder = folder
         self.unit = unit
         self.disk = disk or Disk()
         self._boot = (boot_id or _kernel_boot_id()).replace("-", "")[:6]
         self._lock = threading.Lock()
-        self._lock_file: TextIO | None = None
+        self._folder_lock: FolderLock | None = None
         self._runs_known: dict[str, _KnownRun] = {}
         self._problems_told: set[str] = set()
         self.runs = folder / "runs"
         self._files = OpenFiles(self.runs)
         self._confirmations = Confirmations(folder / "confirmed", self.disk)
         self._deleted = folder / "deleted"
+        self.problem = ""
+        try:
+            self._make_folders()
+        except StorageError as e:
+            if not (may_be_read_only and self.runs.is_dir()):
+                raise
+            self.problem = str(e)
+
+    def _make_folders(self) -> None:
         try:
             for path in (self.runs, self._confirmations.folder):
                 path.mkdir(parents=True, exist_ok=True)
             if not os.access(self.runs, os.W_OK):
-                raise PermissionError(errno.EACCES, "not writable")
+                is_read_only = os.statvfs(self.runs).f_flag & os.ST_RDONLY
+                number = errno.EROFS if is_read_only else errno.EACCES
+                raise OSError(number, os.strerror(number))
         except OSError as e:
             raise StorageError(
-                f"storage folder {folder}: {e.strerror or e}. Set storage.folder (or --storage) to a "
+                f"storage folder {self.folder}: {e.strerror or e}. Set storage.folder (or --storage) to a "
                 "folder that this user can write"
             ) from e
 
@@ -109,26 +133,22 @@ class RunStore:
         StorageError
             If another one has it.
         """
-        path = self.folder / "lock"
         try:
-            self._lock_file = path.open("w")
-            fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._folder_lock = FolderLock(self.folder)
         except BlockingIOError as e:
-            self.unlock()
             raise StorageError(
                 f"storage folder {self.folder} is in use by another bricktrackd. Stop that one, or set "
                 "storage.folder (or --storage) to another folder"
             ) from e
         except OSError as e:
-            self.unlock()
-            raise storage_error(f"{path}: cannot be locked", e) from e
+            raise storage_error(f"{self.folder}: cannot be locked", e) from e
 
     def unlock(self) -> None:
         """Let others have the folder; also closes what reading left open."""
         self._files.close()
-        if self._lock_file is not None:
-            self._lock_file.close()
-            self._lock_file = None
+        if self._folder_lock is not None:
+            self._folder_lock.release()
+            self._folder_lock = None
 
     # New runs
 
@@ -138,8 +158,9 @@ class RunStore:
         Raises
         ------
         StorageError
-            If the counter cannot be written.
+            If the counter cannot be written, or there is no place for runs.
         """
+        self._make_folders()  # they may have been missing on a card that could not be written
         path = self.folder / "next_run.json"
         number = 1 + max((_counter_of(p.name) for p in self._entries()), default=0)
         try:
@@ -152,6 +173,11 @@ class RunStore:
         except OSError as e:
             raise storage_error(f"{path}: the run counter cannot be written", e) from e
         return f"{self.unit}_{self._boot}_{number:04d}" + (f"_{label}" if label else "")
+
+    def is_own(self, run_id: str) -> bool:
+        """Tell whether a run is named as those of this unit are."""
+        own = re.match(re.escape(self.unit) + _COUNTER_IN_ID.pattern, run_id)
+        return own is not None
 
     def free_bytes(self) -> int:
         """Return the free space; raise `StorageError` where the card does not tell."""
@@ -280,13 +306,13 @@ class RunStore:
                 f"no host has confirmed that it holds run {run_id}: pull it first, or force its deletion",
             )
         try:
-            self._files.close(run_id)
             n_bytes = sum(p.stat().st_size for p in folder.iterdir())
             self._deleted.mkdir(exist_ok=True)
             shutil.rmtree(self._deleted / run_id, ignore_errors=True)
             with self._lock:
                 self._runs_known.pop(run_id, None)
                 self.disk.rename(folder, self._deleted / run_id)
+            self._files.close(run_id)  # now no reader can open one again, and keep its room on the card
             self.disk.sync_folder(self.runs)
             self._confirmations.forget(run_id)
             shutil.rmtree(self._deleted / run_id)

@@ -119,6 +119,49 @@ def test_a_run_that_was_saved_before_the_kill_is_not_touched(tmp_path: Path) -> 
     assert list((tmp_path / "box").iterdir()) == []
 
 
+def test_a_copy_that_was_first_cut_from_an_earlier_keyframe_has_its_pictures_where_the_frames_say(
+    tmp_path: Path,
+) -> None:
+    """Just after the first edge a run may still be cut from before its window: pre-roll under 0.3 s."""
+    run_id = "unit-1_b3f2a7_0001"
+    whole = recording(run_id)
+    assert whole.video is not None
+    later = [replace(r, byte_offset=r.byte_offset - 400) for r in whole.video.records[4:]]
+    black_box = BlackBox(tmp_path / "box")
+    black_box.begin(run_id, 1000)
+    black_box.take(lambda: cut_after(whole, 3))
+    black_box.take(lambda: replace(whole, video=VideoCut(whole.video.packets[4:], later, 0, 0, [])))
+    del black_box
+    store = store_in(tmp_path)
+    assert recover_runs(store, tmp_path / "box") == [run_id]
+    run = read_run(store.runs / run_id, verify_hashes=True)
+    assert run.video is not None and run.frames is not None and run.frames.n_frames == N_FRAMES - 4
+    assert run.video.read_bytes() == b"".join(p.data for p in whole.video.packets[4:])
+
+
+def test_a_copy_that_a_daemon_is_at_work_on_is_nobody_elses_until_it_is_gone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run_id = "unit-1_b3f2a7_0001"
+    at_work = BlackBox(tmp_path / "box")
+    at_work.begin(run_id, 1000)
+    at_work.take(lambda: cut_after(recording(run_id), 3))
+    other = store_in(tmp_path / "other card")
+    assert recover_runs(other, tmp_path / "box") == []
+    assert "another bricktrackd is at work on it" in caplog.text
+    at_work.take(lambda: recording(run_id))
+    del at_work  # the process is gone
+    assert recover_runs(other, tmp_path / "box") == [run_id]
+    check_whole(read_run(other.runs / run_id, verify_hashes=True))
+
+
+def test_a_copy_of_another_unit_is_left_to_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for unit in ("unit-2", "unit", "unit-1_b"):
+        copy_of(f"{unit}_b3f2a7_0001", tmp_path / "box")
+    assert recover_runs(store_in(tmp_path), tmp_path / "box") == []
+    assert len(list((tmp_path / "box").iterdir())) == 3 and caplog.text.count("is of another unit") == 3
+
+
 def test_arming_first_brings_in_what_is_left_in_memory(bench: MakeBench, tmp_path: Path) -> None:
     box = tmp_path / "box"
     copy_of("unit-1_b3f2a7_0001", box)

@@ -29,7 +29,7 @@ def test_a_card_that_does_not_say_how_full_it_is_is_named(tmp_path: Path) -> Non
     (tmp_path / "card").rename(tmp_path / "gone")
     with pytest.raises(StorageError, match=r"card: its free space cannot be told: No such file"):
         store.free_bytes()
-    with pytest.raises(StorageError, match=r"lock: cannot be locked: No such file"):
+    with pytest.raises(StorageError, match=r"card: cannot be locked: No such file"):
         store.lock()
 
 
