@@ -7,6 +7,7 @@ from pathlib import Path
 from types import FrameType
 
 from bricktrack_common.discovery import Announcement
+from bricktrack_common.errors import StorageError
 from bricktrack_common.key_files import fingerprint
 from bricktrack_device.capture.black_box import black_box_folder
 from bricktrack_device.capture.recorder import Recorder
@@ -57,10 +58,13 @@ class Daemon:
         Raises
         ------
         BricktrackError
-            If the storage folder cannot be written or the port is taken.
+            If the storage folder cannot be made, another daemon has it, or the port is taken. One that can
+            only be read is served as it is, and the status says so.
         """
         raise_descriptor_limit()
-        store = RunStore(self._config.storage_folder, self._config.unit.name)
+        store = RunStore(self._config.storage_folder, self._config.unit.name, may_be_read_only=True)
+        if store.problem:
+            logger.error("%s. What is there is served; nothing can be recorded", store.problem)
         try:
             store.lock()
             settings = RemoteSettings(self._config, store.folder)
@@ -71,8 +75,7 @@ class Daemon:
             folder = self._config.keys_folder
             keys = None if folder is None else UnitKeys(folder)
             server = FileServer(self._config.server.address, self._config.server.port, service, keys=keys)
-            for run_id in recover_runs(store, black_box_folder(self._config)):
-                logger.warning("%s: recovered; its manifest says what it lacks", run_id)
+            self._recover(store)
             if threading.current_thread() is threading.main_thread():
                 self._heed_signals()
             service.health.refresh_if_due(recorder.state)
@@ -87,6 +90,13 @@ class Daemon:
         finally:
             store.unlock()
             self._rig.close()
+
+    def _recover(self, store: RunStore) -> None:
+        try:
+            for run_id in recover_runs(store, black_box_folder(self._config)):
+                logger.warning("%s: recovered; its manifest says what it lacks", run_id)
+        except StorageError as e:
+            logger.error("nothing was recovered: %s", e)  # the unit must come up, if only to say so
 
     def _heed_signals(self) -> None:
         for number in STOP_SIGNALS:

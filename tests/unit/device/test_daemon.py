@@ -1,15 +1,19 @@
+import errno
 import os
+import shutil
 import signal
 import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zmq
 from device_fakes import FakeCamera, FakeRig
+from saved_runs import confirmed_run, store_in
 
 from bricktrack_common.checksums import crc32, sha256_bytes
 from bricktrack_common.errors import DeviceError, StorageError
@@ -44,6 +48,21 @@ from bricktrack_common.wire_messages import (
 from bricktrack_device.config import DeviceConfig, RecordingTable, ServerTable, StorageTable, UnitTable
 from bricktrack_device.daemon import STOP_SIGNALS, Daemon
 from bricktrack_device.interfaces import Still
+from bricktrack_device.storage.disk import Disk
+
+
+def make_read_only(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a card refuse every write from now on, as a kernel does that found it faulty."""
+
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    may = os.access
+    monkeypatch.setattr(
+        os, "access", lambda p, mode, **k: not (mode & os.W_OK and folder in Path(p).parents) and may(p, mode)
+    )
+    for name in ("make_folder", "write_file", "rename", "sync_file"):
+        monkeypatch.setattr(Disk, name, refuse)
 
 
 class Unit:
@@ -148,6 +167,32 @@ def test_a_host_arms_watches_reads_and_confirms_a_run(unit: Unit, tmp_path: Path
     assert right == Confirmed(run_id=armed.run_id)
     listed, _ = unit.ask(ListRuns())
     assert isinstance(listed, RunList) and listed.runs[0].confirmed
+
+
+def test_on_a_card_that_can_only_be_read_runs_are_served_and_none_is_promised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_in(tmp_path)
+    run_id = confirmed_run(store)
+    shutil.copytree(store.runs / run_id, store.runs / f"{run_id}_cut.partial")
+    make_read_only(tmp_path, monkeypatch)
+    with closing(Unit(tmp_path)) as unit:
+        status = unit.status()
+        assert (status.state, status.runs, status.runs_unconfirmed) == ("idle", 1, 0)
+        (storage,) = (item for item in status.health if item.name == "storage")
+        assert storage.level == "fail" and "Permission denied" in storage.words
+        described, _ = unit.ask(DescribeRun(run_id=run_id))
+        assert isinstance(described, RunDescription)
+        whole = Read(run_id=run_id, file_index=0, offset=0, length=described.files[0].n_bytes)
+        _, data = unit.ask(whole)
+        assert data is not None and sha256_bytes(data) == described.files[0].sha256
+        refused, _ = unit.ask(Arm(label=""))
+        assert isinstance(refused, Refusal) and "storage folder" in refused.message
+        refused, _ = unit.ask(Confirm(run_id=run_id, sha256=[f.sha256 for f in described.files]))
+        assert isinstance(refused, Refusal) and "Read-only file system" in refused.message
+        assert (store.runs / f"{run_id}_cut.partial").exists()
+        monkeypatch.undo()  # put right while the daemon runs
+        assert isinstance(unit.ask(Arm(label="again"))[0], Armed)
 
 
 def test_disarm_answers_and_unknown_runs_are_refused(unit: Unit) -> None:
