@@ -42,7 +42,7 @@ def test_a_frame_whose_covariance_rounding_has_lost_is_still_judged():
 
     def chi2(covariance):
         estimate = replace(done.estimate, covariance=covariance)
-        return frame_chi2(done.problem, done.passed, estimate, 0, done.nodes, done.used)[2]
+        return frame_chi2(done.problem, done.passed, estimate, 0, done.nodes, done.used)
 
     lost = done.estimate.covariance.copy()
     lost[done.nodes.node_of_frame[9], 0, 4, 4] = np.nan

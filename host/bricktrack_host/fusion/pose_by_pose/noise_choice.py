@@ -35,6 +35,7 @@ _MAX_SCALE_ROUNDS = 4
 _SCALE_STANDS = 1.25
 _LEAST_SCALE = 0.3  # what frames have in common stays hidden; this much of their sd is left
 _CLEARLY_LESS = 0.7
+_TURN_AND_SHIFT = slice(0, 3), slice(3, 6)
 _CHI_3_MEDIAN = 1.538  # median of the root of chi-square with 3 degrees of freedom
 
 
@@ -45,8 +46,8 @@ def _with_sensors(lin: Linearisation, x: FloatArray) -> Linearisation:
 
 def frame_chi2(
     problem: Problem, passed: Filter, estimate: Estimate, b: int, nodes: Nodes, used: BoolArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how far each frame lies from what all the others say: rotation and position (3), and both (6).
+) -> FloatArray:
+    """Return how far each frame of run ``b`` lies from what all the others say, 6 degrees of freedom.
 
     The smoothed state holds the frame itself. Taken out of it again: with A = H P H', r the residual and R
     the covariance that the filter gave the frame, the others alone leave R (R - A)^-1 r, and know the frame
@@ -54,29 +55,50 @@ def frame_chi2(
     than R, the state was linearised too far off to take the frame out: there it is judged as it is. Where
     rounding left no A (NaN), a frame is judged by its own covariance alone.
     """
+    return _off_the_others(problem, passed, estimate, b, nodes, used).chi2_of_all()
+
+
+class _Off(NamedTuple):
+    """How far frames lie from what all the others say: along axes of their own, each with its variance.
+
+    ``axes``, shape (n_frames, 6, 6): in columns; ``along`` and ``variance``, shape (n_frames, 6).
+    """
+
+    axes: FloatArray
+    along: FloatArray
+    variance: FloatArray
+
+    def chi2_of_all(self) -> FloatArray:
+        """Return how far by all six components, shape (n_frames,)."""
+        return np.asarray((self.along**2 / self.variance).sum(axis=1))
+
+    def chi2(self, part: slice) -> FloatArray:
+        """Return how far by some of the six components alone, shape (n_frames,)."""
+        axes = self.axes[:, part]
+        r = (axes @ self.along[..., None])[..., 0]
+        S = (axes * self.variance[:, None]) @ np.swapaxes(axes, -1, -2)
+        return np.asarray((r * np.linalg.solve(S, r[..., None])[..., 0]).sum(axis=1))
+
+
+def _off_the_others(
+    problem: Problem, passed: Filter, estimate: Estimate, b: int, nodes: Nodes, used: BoolArray
+) -> _Off:
+    """Return how far the frames of run ``b`` lie from what all the others say, see `frame_chi2`."""
     at = nodes.node_of_frame
     r, H = residuals(problem, estimate.state, at, b)
     H = H[..., estimate.of]
+    inflation = passed.inflation[at, b][:, None]
+    root = np.linalg.cholesky(problem.cov_seen[at, b] * inflation[..., None])
+    whiten = np.linalg.inv(root)
+    H = whiten @ H
     A = H @ estimate.covariance[at, b] @ np.swapaxes(H, -1, -2)
     A[~np.isfinite(A).all(axis=(1, 2))] = 0.0
-    stated = problem.cov_seen[at, b]
-    inflation = passed.inflation[at, b][:, None]
-    root = np.linalg.cholesky(stated * inflation[..., None])
-    white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, A), -1, -2))
-    share, V = np.linalg.eigh(0.5 * (white + np.swapaxes(white, -1, -2)))
+    share, V = np.linalg.eigh(0.5 * (A + np.swapaxes(A, -1, -2)))
     # A frame that alone fixes the state leaves no residual, and R - A near zero: judge it by a share of R.
     rest = np.where(used[:, None] & (share <= 1), 1.02 - share, 1.0)
     known = np.where(used[:, None], np.where(share <= 1, share + share**2 / rest, 0.0), share)
-    axes = root @ V
-    along = np.linalg.solve(axes, r[..., None])[..., 0] / rest
-    r = (axes @ along[..., None])[..., 0]
-    S = axes * (1 / inflation + known)[:, None, :] @ np.swapaxes(axes, -1, -2)
-
-    def chi2(part: slice) -> FloatArray:
-        e = r[:, part]
-        return np.asarray((e * np.linalg.solve(S[:, part, part], e[..., None])[..., 0]).sum(axis=1))
-
-    return chi2(slice(0, 3)), chi2(slice(3, 6)), chi2(slice(0, 6))
+    along = (np.swapaxes(V, -1, -2) @ (whiten @ r[..., None]))[..., 0] / rest
+    return _Off(root @ V, along, 1 / inflation + known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,11 +166,11 @@ def settle_noise(
             )
         passed = Filter(problem)
         estimate = passed.smooth()
-        chi2s = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b]) for b in range(len(runs))]
-        more = [np.sqrt([np.median(turn), np.median(shift)]) / _CHI_3_MEDIAN for turn, shift, _ in chi2s]
+        offs = [_off_the_others(problem, passed, estimate, b, nodes[b], used[b]) for b in range(len(runs))]
+        more = [np.sqrt([np.median(off.chi2(p)) for p in _TURN_AND_SHIFT]) / _CHI_3_MEDIAN for off in offs]
         done = max(float(m.max()) for m in more) < _SCALE_STANDS
         # By the scales that have just been refined, not those the pass was made with.
-        both = [c[2] / max(float(m.max()), 1.0) ** 2 for c, m in zip(chi2s, more, strict=True)]
+        both = [off.chi2_of_all() / max(float(m.max()), 1.0) ** 2 for off, m in zip(offs, more, strict=True)]
         scales = [_settled_scale(scale * m, done) for scale, m in zip(scales, more, strict=True)]
         if done:
             break

@@ -115,7 +115,7 @@ def smooth_poses(
     for is_last in [False] * (_LAST_PASSES - 1) + [True]:
         passed = Filter(problem)
         estimate = passed.smooth()
-        chi2 = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b])[2] for b in range(len(runs))]
+        chi2 = [frame_chi2(problem, passed, estimate, b, nodes[b], used[b]) for b in range(len(runs))]
         judged = [_judged(*three, settings) for three in zip(used, chi2, scales, strict=True)]
         if is_last or all(np.array_equal(u, j) for u, j in zip(used, judged, strict=True)):
             break
