@@ -9,11 +9,11 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
 
-from bricktrack_common.clocks import check_monotonic_is_boottime, monotonic_ns, read_clock_triplet
+from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import BricktrackError, StorageError
 from bricktrack_common.wire_messages import Armed, DaemonState, Disarmed, Refusal
+from bricktrack_device.capture.arming import new_session
 from bricktrack_device.capture.black_box import BlackBox, black_box_folder
 from bricktrack_device.capture.commands import (
     Answer,
@@ -25,13 +25,11 @@ from bricktrack_device.capture.commands import (
 )
 from bricktrack_device.capture.kept_run import KeptRun
 from bricktrack_device.capture.recorder_status import RecorderStatus, status_of
-from bricktrack_device.capture.retention import make_room
-from bricktrack_device.capture.room import check_room, disk_needed_bytes
+from bricktrack_device.capture.room import disk_needed_bytes
 from bricktrack_device.capture.run_light import RunLight
 from bricktrack_device.capture.session import Session
 from bricktrack_device.capture.state_table import Cause, StateMachine
 from bricktrack_device.config import DeviceConfig
-from bricktrack_device.in_time import in_time
 from bricktrack_device.interfaces import Rig
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.storage.run_store import RunStore
@@ -41,7 +39,6 @@ logger = logging.getLogger(__name__)
 _TICK_S = 0.02
 _IDLE_TICK_S = 0.2
 _RETRY_S = 10.0
-_BRING_IN_TIMEOUT_S = 60.0
 
 
 class _StoppingError(BricktrackError):
@@ -214,26 +211,19 @@ class Recorder:
     # Arming and disarming
 
     def _arm(self, label: str, duration_s: float | None) -> Session:
-        self._must_allow("arm")
+        self._machine.require("arm", run_id=self._run_id)
         self._doing = "arming"
         try:
-            duration_s = duration_s or self._config.recording.duration_s
-            check_monotonic_is_boottime(read_clock_triplet())
-            # Where the card was full when the daemon began; a slow one takes its time.
-            bring_in = partial(self._black_box.bring_in, self._store)
-            in_time("bringing a run in", bring_in, _BRING_IN_TIMEOUT_S, beat=self.beat)
-            make_room(self._config, self._store, duration_s)
-            check_room(self._config, self._store, duration_s)
-            session = Session(
+            session = self._session = new_session(
                 self._config,
                 self._rig,
-                run_id=self._store.new_run_id(label),
+                self._store,
+                self._black_box,
                 label=label,
-                duration_s=duration_s,
+                duration_s=duration_s or self._config.recording.duration_s,
                 light=self._light,
                 beat=self.beat,
             )
-            self._session = session
             try:
                 session.open(lambda: self._inbox.put(None))
             except BaseException:
@@ -256,7 +246,7 @@ class Recorder:
         self._auto_arm = False
         if self.state == "idle":
             return
-        self._must_allow("disarm")
+        self._machine.require("disarm", run_id=self._run_id)
         self._close_session()
         self._change("disarm")
 
@@ -280,20 +270,6 @@ class Recorder:
     def note_lost_camera(self, words: str) -> None:
         """Hear why only a new start of the daemon gives the camera back; ``""`` says that it is not so."""
         self._lost_camera = self._lost_camera or words
-
-    def _must_allow(self, cause: Cause) -> None:
-        if self._machine.allows(cause):
-            return
-        session = self._session
-        of_run = f" run {session.run_id}" if session else ""
-        remedies: dict[DaemonState, str] = {
-            "armed": "disarm it first",
-            "recording": "the recording ends by itself",
-            "saving": "wait until the run is saved",
-            "fault": f"{self._machine.reason}. Disarm clears the fault",
-        }
-        words = remedies.get(self.state, "nothing to do")
-        raise RequestRefusedError("wrong-state", f"the unit is {self.state}{of_run}: {words}")
 
     # Ending a run
 
@@ -383,6 +359,10 @@ class Recorder:
         self._close_session()
         self._change("failure", reason=reason)
 
+    @property
+    def _run_id(self) -> str:
+        return self._session.run_id if self._session else ""
+
     def _close_session(self) -> None:
         session, self._session = self._session, None
         if session is not None:
@@ -393,8 +373,7 @@ class Recorder:
         change = self._machine.change(cause, reason=reason)
         if change.after in ("idle", "fault"):
             self._light.put_out()
-        session = self._session
-        of_run = run_id or (session.run_id if session else "")
+        of_run = run_id or self._run_id
         logger.info(
             "%s -> %s (%s)%s%s",
             change.before, change.after, change.cause, f" {of_run}" if of_run else "",

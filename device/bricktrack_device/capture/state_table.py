@@ -5,6 +5,7 @@ from typing import Literal
 
 from bricktrack_common.errors import DeviceError
 from bricktrack_common.wire_messages import DaemonState
+from bricktrack_device.refusals import RequestRefusedError
 
 Cause = Literal[
     "arm", "disarm", "first-edge", "window-over", "stop", "saved", "save-failed", "save-again", "failure"
@@ -65,6 +66,26 @@ class StateMachine:
     def allows(self, cause: Cause) -> bool:
         """Tell whether ``cause`` leads anywhere from here."""
         return (self._state, cause) in TRANSITIONS
+
+    def require(self, cause: Cause, *, run_id: str = "") -> None:
+        """Refuse a command that leads nowhere from here, and say what does; ``run_id`` is that under way.
+
+        Raises
+        ------
+        RequestRefusedError
+            If the table has no such way.
+        """
+        if self.allows(cause):
+            return
+        remedies: dict[DaemonState, str] = {
+            "armed": "disarm it first",
+            "recording": "the recording ends by itself",
+            "saving": "wait until the run is saved",
+            "fault": f"{self._reason}. Disarm clears the fault",
+        }
+        words = remedies.get(self._state, "nothing to do")
+        of_run = f" run {run_id}" if run_id else ""
+        raise RequestRefusedError("wrong-state", f"the unit is {self._state}{of_run}: {words}")
 
     def change(self, cause: Cause, *, reason: str = "") -> StateChange:
         """Follow the table; a fault needs its reason.
