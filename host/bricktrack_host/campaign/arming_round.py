@@ -48,6 +48,8 @@ class ArmingRound(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     def run_of(self, unit: str, run_ids: Iterable[str], name: str) -> str | None:
         """Return the newest of a unit's runs that is of this test and this round; `None` without one.
 
+        That is so too of a unit of which nobody knows what runs it had before the round.
+
         Examples
         --------
         >>> once_more = ArmingRound(before={"b2": ["b2_9f31c2_0007_s"]})

@@ -45,7 +45,7 @@ def settle_delay(
         With the delay to begin at.
     lever_arm_mm : ndarray, shape (3,), mm, brick axes
     is_near : bool
-        Whether that is good to a millisecond or two.
+        Whether the delay to begin at is good to a millisecond or two.
     """
 
     def log_likelihood(delay_s: float) -> float:

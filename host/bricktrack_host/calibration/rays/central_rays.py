@@ -53,9 +53,9 @@ class CentralRays(UncertainRays):
         The projection centre (x0, y0, z0) of rays near the axis.
     covariance_order : int
         Highest degree that the covariance speaks of: ``order`` or, with misfit, more.
-    covariance : ndarray, shape (2 n_terms + 3, 2 n_terms + 3)
+    covariance : ndarray, shape (2 m + 3, 2 m + 3), m terms up to ``covariance_order``
         Of [slope x, x0, slope y, y0, z0], the slopes as coefficients of Legendre products
-        (`calibration.pixel_legendre`); with a walking pupil one more row and column, of w.
+        (`calibration.rays.pixel_legendre`); with a walking pupil one more row and column, of w.
     region : ConvexRegion
         Hull of the dots seen at any plane.
     residuals : tuple of PlaneResiduals

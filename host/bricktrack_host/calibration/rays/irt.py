@@ -54,9 +54,9 @@ class TwoPlaneIrt(UncertainRays):
         C (for x) and D (for y) of the scaled pixel, in the order of `pixel_polynomials.exponents`.
     covariance_order : int
         Highest degree that the covariance speaks of: ``order`` or, with misfit, more.
-    covariance : ndarray, shape (4 n_terms, 4 n_terms), mm^2
+    covariance : ndarray, shape (4 m, 4 m), mm^2, m terms up to ``covariance_order``
         Of [C at A, C at B, D at A, D at B] as coefficients of Legendre products
-        (`calibration.pixel_legendre`): what the planes have in common is in the blocks off the diagonal.
+        (`calibration.rays.pixel_legendre`): what the planes have in common is in the blocks off the diagonal.
     region_a, region_b : ConvexRegion
         Hull of the dots seen at either plane.
     residuals : tuple of PlaneResiduals

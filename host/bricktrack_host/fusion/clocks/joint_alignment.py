@@ -47,6 +47,8 @@ def align_jointly(
 ) -> tuple[TimeAlignment, TimeAlignment]:
     """Return both alignments refined together: offsets, skews, and the gyros' common low-pass.
 
+    They come back as given where too few poses lie within both sensors' samples.
+
     Parameters
     ----------
     optical : OpticalTrack
@@ -54,7 +56,8 @@ def align_jointly(
         With the stamps of their reads; in brick axes and in camera axes.
     brick, camera : TimeAlignment
         Where to begin; both found from the motion, to some milliseconds.
-    camera_bias_radps : ndarray, shape (3,)
+    camera_bias_radps : ndarray, shape (3,), rad/s, camera axes
+        Of the camera's gyro.
 
     Notes
     -----

@@ -45,7 +45,10 @@ def still_sightings(leds: SeenLeds) -> BoolArray:
 
 
 def believed_covariance_px2(leds: SeenLeds, still: BoolArray, scales: FloatArray) -> FloatArray:
-    """Return the covariance of centroids whose stated sd is off by ``scales``, shape (m, 2, 2).
+    """Return the covariance of centroids whose stated sd is off by ``scales``, shape (m, 2, 2), px^2.
+
+    ``still``, shape (m,), says which are of pictures at rest; ``scales``, shape (2,), hold what those of
+    moving pictures and of such at rest are multiplied by.
 
     What is stated of a picture that moves is mostly its smear, and may be several times too much. What a
     picture at rest is unsure by, one that moves slowly is unsure by as well.

@@ -51,6 +51,14 @@ def pose_jumps(t_s: FloatArray, z: FloatArray, cov: FloatArray) -> FloatArray:
     A jump is what neither side foresees, by parabolas through three frames, while each side foresees its own
     to a small part of that: calm before, calm after, and nothing says when it went from one to the other.
     Over a longer gap no parabola foresees anything, and the smoother's own covariance holds.
+
+    Parameters
+    ----------
+    t_s : ndarray, shape (n,), s
+    z : ndarray, shape (n, 6)
+        Rotation vector, rad, and position, mm, of each frame.
+    cov : ndarray, shape (n, 6, 6)
+        Of these.
     """
     jumps = np.zeros((len(t_s) - 1, 6))
     steps = np.diff(t_s)
