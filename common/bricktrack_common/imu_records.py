@@ -43,7 +43,8 @@ class ImuFlag(IntFlag):
 
     NONE = 0
     GAP = 1
-    """No data: the read failed, or the slot was skipped because the one before ran over."""
+    """No data: the read failed, the slot was skipped because the one before ran over, or the read took longer
+    than a slot, as on a bus that hung and came free: nobody knows when the chip was asked."""
     LATE = 2
     """The read began more than 2 ms after its slot; the stamp is right, the spacing is not."""
     REPEAT = 4
@@ -210,7 +211,7 @@ def decode_imu(description: ImuDescription, records: list[ImuRecord]) -> ImuSamp
         if record.status is not None and len(record.status) == 3:
             wrong = record.status[2] != description.opr_mode
         mode_wrong[i:] = wrong
-        if record.data is not None:
+        if record.data is not None and record.t_after_ns - record.t_before_ns <= description.period_ns:
             raw[i] = np.frombuffer(record.data, dtype=np.uint8)
             t_ns[i] = (record.t_before_ns + record.t_after_ns) // 2 + description.latency_ns
             late = record.t_before_ns - t_due[i] > 2_000_000

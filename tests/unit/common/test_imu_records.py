@@ -1,3 +1,4 @@
+import dataclasses
 import struct
 
 import numpy as np
@@ -50,6 +51,15 @@ def test_a_failed_read_and_a_skipped_slot_are_gaps_at_their_due_time():
     assert [bool(f & ImuFlag.GAP) for f in s.flags] == [False, True, True, False]
     assert np.isnan(s.acc_mps2[1:3]).all()
     assert s.t_ns[2] == AMG.t0_ns + 2 * AMG.period_ns
+
+
+def test_a_read_that_outlasts_its_slot_is_a_gap_for_nobody_knows_when_it_was_measured():
+    hung = dataclasses.replace(record(1, burst(1)), t_after_ns=AMG.t0_ns + 80 * AMG.period_ns)
+    s = decode([record(0, burst(0)), hung, record(81, burst(81))])
+    assert s.flags[1] == ImuFlag.GAP and np.isnan(s.acc_mps2[1:81]).all()
+    assert (np.diff(s.t_ns) > 0).all()
+    just_in_time = dataclasses.replace(hung, t_after_ns=hung.t_before_ns + AMG.period_ns)
+    assert decode([just_in_time]).flags.tolist() == [0]
 
 
 def test_an_equal_sample_is_kept_and_flagged_as_a_repeat():
