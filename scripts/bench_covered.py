@@ -20,6 +20,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import av
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -79,7 +80,10 @@ class Solved:
         first = start_poses(seen, film.rays, film.brick)
         errors = frame_errors(seen, first, film.rays, film.brick)
         seen, errors = with_odd_leds_doubted(seen, errors)
-        track = solve_poses(with_measured_noise(seen, errors), film.rays, film.brick, first=first)
+        with av.open(str(film.folder / "video.h264")) as container:
+            is_keyframe = np.array([packet.is_keyframe for packet in container.demux(video=0) if packet.size])
+        seen = with_measured_noise(seen, errors, is_keyframe)
+        track = solve_poses(seen, film.rays, film.brick, first=first)
         posed = int(np.flatnonzero(np.isfinite(track.t_camera_brick_mm[:, 0]))[0])
         about = Pose(track.R_camera_brick[posed], track.t_camera_brick_mm[posed])
         assert isinstance(film.rays, CentralRays | TwoPlaneIrt)  # noqa: S101 - a calibration file has no others

@@ -97,7 +97,8 @@ def solve_run(
         observations, errors = with_odd_leds_doubted(observations, errors)
         problems += words_on_odd_leds(observations, brick)
         problems += words_on_unused_leds(observations, brick)
-        observations = with_measured_noise(observations, errors)
+        is_keyframe = None if run.frames is None else run.frames.keyframe
+        observations = with_measured_noise(observations, errors, is_keyframe)
         optical = solve_poses(
             observations, rays, brick, rolling_shutter=settings.rolling_shutter, first=first
         )

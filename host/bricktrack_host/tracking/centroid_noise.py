@@ -24,6 +24,9 @@ logger = logging.getLogger(__name__)
 
 _PRIOR_DOF = 1.0
 """What the floor, of another camera, counts for beside the residuals' own degrees of freedom."""
+_KIND_DOF = 8.0
+"""What the whole run counts for beside the residuals of one kind of its pictures."""
+_OTHERS, _KEYFRAME, _AFTER_KEYFRAME = range(3)
 _CLIP_SIGMAS = 3.0
 _CLIPPED_VARIANCE = 0.9733  # of a normal variable within three sigmas of its mean
 _MOST_STANDING = 0.9  # of a centroid's variance: the noise of its pixels is new in every picture
@@ -51,7 +54,9 @@ class CentroidNoise:
     n_frames: int
 
 
-def with_measured_noise(observations: LedObservations, errors: FrameErrors) -> LedObservations:
+def with_measured_noise(
+    observations: LedObservations, errors: FrameErrors, is_keyframe: BoolArray | None = None
+) -> LedObservations:
     """Return observations with the run's own noise in their covariances in place of the floor.
 
     Parameters
@@ -60,6 +65,8 @@ def with_measured_noise(observations: LedObservations, errors: FrameErrors) -> L
         With covariances as the segmentation states them: the pixels' noise and `FLOOR_SD_PX`.
     errors : FrameErrors
         Of the same observations.
+    is_keyframe : ndarray of bool, shape (n,), optional
+        Frames whose pictures were coded for themselves; default: not known, all have one noise.
     """
     noise = measure_noise(errors)
     logger.info(
@@ -68,8 +75,31 @@ def with_measured_noise(observations: LedObservations, errors: FrameErrors) -> L
         noise.dof,
         noise.n_frames,
     )
-    more = (noise.sd_px**2 - FLOOR_SD_PX**2) * np.eye(2)
+    variance = np.full(len(observations.uv_px), noise.sd_px**2)
+    if is_keyframe is not None:
+        kinds = _picture_kinds(is_keyframe)
+        variance = _variance_of_kinds(errors, kinds, noise)[kinds]
+    more = (variance - FLOOR_SD_PX**2)[:, None, None, None] * np.eye(2)
     return replace(observations, cov_px2=observations.cov_px2 + more)
+
+
+def _picture_kinds(is_keyframe: BoolArray) -> IntArray:
+    kinds = np.where(np.append(False, is_keyframe[:-1]), _AFTER_KEYFRAME, _OTHERS)
+    return np.where(is_keyframe, _KEYFRAME, kinds)
+
+
+def _variance_of_kinds(errors: FrameErrors, kinds: IntArray, of_run: CentroidNoise) -> FloatArray:
+    """Return the variance of the centroids in each kind of pictures, shape (3,), px^2.
+
+    Kinds differ by a factor; how little the run's residuals may say of all of them is in the run's variance.
+    """
+    share = np.ones(3)
+    for kind in range(3):
+        own = measure_noise(errors, errors.seen & (kinds[errors.frames] == kind)[:, None])
+        if own.dof > 0:
+            shown = (own.seen_sd_px / of_run.seen_sd_px) ** 2
+            share[kind] = (_KIND_DOF + own.dof * shown) / (_KIND_DOF + own.dof)
+    return share * of_run.sd_px**2
 
 
 def measure_noise(errors: FrameErrors, leds: BoolArray | None = None) -> CentroidNoise:

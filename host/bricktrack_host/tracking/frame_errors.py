@@ -30,6 +30,8 @@ class FrameErrors:
 
     Attributes
     ----------
+    frames : ndarray of int64, shape (n,)
+        Which of the run's they are.
     seen : ndarray of bool, shape (n, n_leds)
     error_px : ndarray, shape (n, n_leds, 2), px
         Seen less predicted; zero where not seen.
@@ -41,6 +43,7 @@ class FrameErrors:
         One standard deviation of what all LEDs have in common: the profile's doubt and the twist's.
     """
 
+    frames: IntArray
     seen: BoolArray
     error_px: FloatArray
     J_px: FloatArray
@@ -104,6 +107,7 @@ def frame_errors(
     floor_px2 = np.minimum(FLOOR_SD_PX**2, np.linalg.eigvalsh(stated)[..., 0])
     pixels = stated - floor_px2[..., None, None] * np.eye(2)
     return FrameErrors(
+        frames=frames,
         seen=seen,
         error_px=np.where(seen[..., None], first.uv_px[frames] - prediction.uv_px, 0.0),
         J_px=J,

@@ -18,6 +18,7 @@ from bricktrack_host.tracks import FusedTrack, LedObservations
 
 _MAX_GAP_PERIODS = 3.5  # wider gaps end a spline: a shaken brick turns back within them
 _FEWEST_FRAMES = 9  # of which five fourth differences are had: fewer may all be small by chance
+_UNEVEN = 0.618034  # multiples of it, less whole numbers, fill 0 to 1 without a period
 _TWIST_FLOOR = np.array([0.005, 0.3])  # rad/s, mm/s: far below what moves a centroid within a frame
 _FUSED_TWIST_SD = np.repeat([0.03, 5.0], 3)  # rad/s, mm/s: of the fused motion between frames
 UNKNOWN_TWIST_SD = np.array([1.0, 1.0, 1.0, 300.0, 300.0, 300.0])
@@ -122,8 +123,11 @@ def calm_frames(first: FirstPoses, motion: LedMotion | None, *, min_leds: int, a
     if frames.size and motion is not None and motion.twist_sd is not None:
         doubt = motion.twist_sd[frames, 3]
         frames = frames[doubt <= max(float(np.median(doubt)), 2 * float(doubt.min()))]
-    few = np.unique(np.linspace(0, max(frames.size - 1, 0), at_most).astype(np.int64))
-    return np.asarray(frames[few] if frames.size else frames)
+    if frames.size <= at_most:
+        return np.asarray(frames)
+    # One of each stretch, not at even steps: of a video's pictures every so many are coded alike.
+    stretch = np.arange(at_most)
+    return np.asarray(frames[((stretch + stretch * _UNEVEN % 1.0) * frames.size / at_most).astype(np.int64)])
 
 
 def carried_px(
