@@ -46,7 +46,7 @@ def across_gravity(imu):
 
 def test_a_sensor_entered_a_quarter_turned_is_refused_with_the_rows_to_check(shaken):
     # A vector of 1 g turned by 90 degrees lies 1.41 g from where it was: 13.9 m/s^2.
-    with pytest.raises(TrackingError, match=r"differ by 1[345]\.. m/s\^2.*`rotation` in \[unit.camera_imu\]"):
+    with pytest.raises(TrackingError, match=r"differ by 1[345]\.. m/s².*`rotation` in \[unit.camera_imu\]"):
         prepared(shaken, turned(shaken.camera, across_gravity(shaken.camera), 90))
 
 

@@ -3,7 +3,7 @@
 The centre of a dot is the first moment of its light above the local background, each pixel's light divided
 by what a fully lit pixel would show there (the plateau of this dot and its neighbours), so that uneven
 light does not pull the centre. It is the centroid of the *image* of the disc;
-`calibration.disc_bias` takes it to the image of the disc's centre once a lens model is at hand.
+`calibration.dots.disc_bias` takes it to the image of the disc's centre once a lens model is at hand.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 """Products of Legendre polynomials of the scaled pixel: the basis in which ray models are fitted.
 
-They span the same polynomials as the monomials that `calibration.pixel_polynomials` evaluates, but are nearly
-orthogonal over a picture: coefficients of one degree are of one size, and a covariance keeps its meaning when
-it is written with nine digits.
+They span the same polynomials as the monomials that `calibration.rays.pixel_polynomials` evaluates, but are
+nearly orthogonal over a picture: coefficients of one degree are of one size, and a covariance keeps its
+meaning when it is written with nine digits.
 """
 
 from functools import lru_cache

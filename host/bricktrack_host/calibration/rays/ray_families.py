@@ -1,7 +1,8 @@
 """The families of ray models as functions of their parameters: what a fit needs to know of each.
 
 A family says where the rays of pixels meet given depths, and how that changes with its parameters. All are
-made of Legendre products of the scaled pixel (`calibration.pixel_legendre`); V is their matrix at the pixels.
+made of Legendre products of the scaled pixel (`calibration.rays.pixel_legendre`); V is their matrix at
+the pixels.
 
 - central: ``(x, y) = (x0, y0) + (z - z0) P``, P the slopes; parameters [P_x, x0, P_y, y0, z0];
 - walking pupil: ``(x, y) = (x0, y0) + (z - z0 - w |P|^2) P``: the steeper a ray, the farther along the axis

@@ -16,7 +16,7 @@ class UncertainRays(ABC):
     """A ray model with the covariance of its parameters.
 
     The covariance holds the dots' noise, the smooth misfit of the polynomials, and what the rig's tolerance
-    leaves open (`calibration.ray_fit`).
+    leaves open (`calibration.rays.ray_fit`).
     """
 
     covariance: FloatArray

@@ -115,7 +115,7 @@ def mend_vibration(gyro_radps: FloatArray, acc_mps2: FloatArray, acc_roughness_m
     gyro_radps, acc_mps2 : ndarray, shape (n, 3)
         At even steps, but for a few missing.
     acc_roughness_mps2 : ndarray, shape (n,)
-        The steady part, see `imu_signal.roughness`.
+        The steady part, see `imu_samples.roughness`.
     """
     gyro = as_float_array("gyro_radps", gyro_radps, (None, 3))
     acc = as_float_array("acc_mps2", acc_mps2, (len(gyro), 3))

@@ -41,7 +41,7 @@ class Problem:
     dv_mps, dp_m, f_rate_mps3, f_curve_mps4 : ndarray, shape (K - 1, B, 3)
         Increments at the linearisation point of biases, lag and loss, see `imu_signal.Increments`.
     known : ndarray, shape (K - 1, B, 4, 3)
-        What a moving camera adds, in still axes, see `moving_camera.CameraMotion.increments`; else zero.
+        What a moving camera adds, in still axes, see `CameraMotion.increments`; else zero.
     gyro_var, acc_var : ndarray, shape (K - 1, B), rad^2/s and m^2/s^3
         Spectral densities of the inertial noise.
     gyro_bias_walk, acc_bias_walk : ndarray, shape (K - 1, B), rad^2/s^3 and m^2/s^5

@@ -1,4 +1,4 @@
-"""The search of a whole picture for lights of an LED's size, compiled; see `segment.find_candidates`."""
+"""The search of a whole picture for lights of an LED's size, compiled; see `find_lights`."""
 
 from math import hypot
 
