@@ -41,14 +41,17 @@ def simulate_two_imus(
     dropouts: tuple[tuple[float, float], ...] = (),
     gain_sd: float = 0.0,
     place_sd_mm: float = 0.0,
+    lowpass_hz: float = 60.0,
+    rotation_sd_deg: float = 0.1,
 ) -> TwoImus:
     """Return a run whose camera is shaken by ``acc_g`` (rms, each axis) at 3-10 Hz and rocked by so much.
 
     The same seed gives the same relative motion, the same optical noise and the same sensor noise. Each
     sensor stamps later than the camera by its own offset. Scale and crossed axes of both are wrong by so much,
-    and their places by so much along each axis.
+    and their places by so much along each axis. Both have a low-pass of second order
+    (Butterworth); ``rotation_sd_deg`` is that of the optical noise.
     """
-    shake = simulate_shake(seed, duration_s=duration_s, dropouts=dropouts)
+    shake = simulate_shake(seed, duration_s=duration_s, dropouts=dropouts, rotation_sd_deg=rotation_sd_deg)
     rng = np.random.default_rng([seed, 5])
     t = shake.t_s
     window = np.clip((t - 0.6) / 0.4, 0, 1) * np.clip((duration_s - 0.6 - t) / 0.4, 0, 1)
@@ -81,7 +84,7 @@ def simulate_two_imus(
         force = body.inv().apply(acceleration - gravity)
         between = (body[:-1].inv() * body[1:]).as_rotvec() * _FINE_HZ
         omega = np.concatenate([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
-        b, a = butter(2, 60.0, fs=_FINE_HZ)
+        b, a = butter(2, lowpass_hz, fs=_FINE_HZ)
         impulse = lfilter(b, a, np.r_[1.0, np.zeros(2000)])
         delay_s = float((np.arange(2001) * impulse).sum() / impulse.sum() / _FINE_HZ)
         gyro = CubicSpline(t - delay_s, lfilter(b, a, omega, axis=0))

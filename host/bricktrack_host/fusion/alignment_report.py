@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.clocks.frame_stamps import StampCheck, check_stamps
-from bricktrack_host.fusion.clocks.rotation_fit import Correlation, correlate
+from bricktrack_host.fusion.clocks.rate_correlation import Correlation, correlate
 from bricktrack_host.fusion.clocks.slip_search import find_slips
 from bricktrack_host.fusion.clocks.stamp_slips import StampSlips
 from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, align_times, has_pose

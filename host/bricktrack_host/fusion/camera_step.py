@@ -7,7 +7,7 @@ nor a step where LEDs come or go while some stand beside their places: poses ste
 
 import numpy as np
 
-from bricktrack_host.fusion.clocks.offset_change import CLOCK_RATE_SD, rotation_fit_of, signal_of
+from bricktrack_host.fusion.clocks.offset_change import errors_of
 from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, has_pose
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
@@ -33,14 +33,11 @@ def words_on_camera_step(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAl
         Of the brick.
     alignment : TimeAlignment
     """
-    if alignment.source != "data":
-        return []
-    posed = has_pose(optical)
-    frames = np.flatnonzero(posed)
-    fit, _ = rotation_fit_of(optical, alignment, signal_of(imu, alignment), posed, CLOCK_RATE_SD)
-    step = fit.attitude_step(alignment.gyro_bias_radps)
+    errors = errors_of(optical, imu, alignment)
+    step = None if errors is None else errors.attitude_step()
     if step is None:
         return []
+    frames = np.flatnonzero(has_pose(optical))
     size_deg = float(np.rad2deg(np.linalg.norm(step.rvec_rad)))
     if step.gain < _KNOCKED_CHI2 or size_deg < _LEAST_DEG:
         return []

@@ -8,9 +8,9 @@ from brick_shakes import simulate_shake
 
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.fusion.camera_step import words_on_camera_step
-from bricktrack_host.fusion.clocks import rotation_fit
-from bricktrack_host.fusion.clocks.offset_change import CLOCK_RATE_SD, rotation_fit_of, signal_of
-from bricktrack_host.fusion.clocks.time_alignment import align_times, has_pose
+from bricktrack_host.fusion.clocks import rotation_errors
+from bricktrack_host.fusion.clocks.offset_change import errors_of
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 
 AT = 60
 
@@ -74,12 +74,11 @@ def test_a_step_is_sought_in_stretches_as_in_the_whole_run(monkeypatch):
     R[500:] = matrix_from_rvec(np.deg2rad([1.2, -1.5, 0.6])) @ R[500:]
     optical = replace(shake.optical, R_camera_brick=R)
     alignment = align_times(optical, shake.imu)
-    signal = signal_of(shake.imu, alignment)
-    fit, _ = rotation_fit_of(optical, alignment, signal, has_pose(optical), CLOCK_RATE_SD)
-    step = fit.attitude_step(alignment.gyro_bias_radps)
-    monkeypatch.setattr(rotation_fit, "_STEPS_AT_ONCE", 10_000)
-    monkeypatch.setattr(rotation_fit, "_STEP_KNOTS", 10_000)
-    whole = fit.attitude_step(alignment.gyro_bias_radps)
+    errors = errors_of(optical, shake.imu, alignment)
+    step = errors.attitude_step()
+    monkeypatch.setattr(rotation_errors, "_STEPS_AT_ONCE", 10_000)
+    monkeypatch.setattr(rotation_errors, "_STEP_KNOTS", 10_000)
+    whole = errors.attitude_step()
     assert step.frame == whole.frame == 500
     assert step.rvec_rad == pytest.approx(whole.rvec_rad, rel=1e-6)
     assert step.covariance == pytest.approx(whole.covariance, rel=1e-6, abs=1e-12)

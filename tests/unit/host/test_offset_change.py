@@ -8,7 +8,7 @@ from brick_shakes import simulate_shake
 from scipy.spatial.transform import Rotation
 
 from bricktrack_host.fusion.clocks import offset_change
-from bricktrack_host.fusion.clocks.offset_change import change_of_halves, offset_wander
+from bricktrack_host.fusion.clocks.offset_change import change_of_halves, errors_of, offset_wander
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 
 SCALE = np.array([1.01, 0.99, 1.0])
@@ -48,7 +48,11 @@ def recording(*, scale=1.0, step_ns=0, wander_s=0.0):
 
 def found(**how):
     optical, imu = recording(**how)
-    return change_of_halves(optical, imu, align_times(optical, imu))
+    return change_of_halves(errors_of(optical, imu, align_times(optical, imu)))
+
+
+def wandering(optical, imu, alignment):
+    return offset_wander(optical, alignment, errors_of(optical, imu, alignment))
 
 
 def test_a_gyro_whose_scale_is_off_is_no_change():
@@ -66,18 +70,18 @@ def test_a_step_of_the_stamps_is_found_whatever_the_scale(scale):
 
 def test_without_an_offset_by_the_motion_nothing_is_told():
     optical, imu = recording()
-    assert change_of_halves(optical, imu, replace(align_times(optical, imu), source="stamps")) is None
+    assert errors_of(optical, imu, replace(align_times(optical, imu), source="stamps")) is None
 
 
 @pytest.mark.parametrize("scale", [1.0, SCALE])
 def test_an_offset_that_stays_does_not_wander(scale):
     optical, imu = recording(scale=scale)
-    assert offset_wander(optical, imu, align_times(optical, imu)) is None
+    assert wandering(optical, imu, align_times(optical, imu)) is None
 
 
 def test_frames_that_are_late_by_turns_are_told_with_how_much():
     optical, imu = recording(wander_s=2e-3)
-    wander = offset_wander(optical, imu, align_times(optical, imu))
+    wander = wandering(optical, imu, align_times(optical, imu))
     # Beside a steady rate: over two waves the clocks seem to run apart, which is put back.
     assert wander.rms_s == pytest.approx(2e-3, rel=0.45)
     assert wander.sd_s.shape == optical.t_ns.shape
@@ -89,14 +93,14 @@ def test_frames_that_are_late_by_turns_are_told_with_how_much():
 def test_a_long_run_is_looked_at_in_stretches(monkeypatch):
     optical, imu = recording(wander_s=2e-3)
     alignment = align_times(optical, imu)
-    whole = offset_wander(optical, imu, alignment)
+    whole = wandering(optical, imu, alignment)
     monkeypatch.setattr(offset_change, "_WANDER_STRETCH_S", 0.6)
-    halves = offset_wander(optical, imu, alignment)
+    halves = wandering(optical, imu, alignment)
     # Each half has a steady rate of its own, which holds more of a wave of 0.7 s.
     assert 0.4 * whole.rms_s < halves.rms_s < 1.1 * whole.rms_s
     assert np.isfinite(halves.sd_s).all() and halves.sd_s.shape == whole.sd_s.shape
     monkeypatch.setattr(offset_change, "_WANDER_STRETCH_S", 0.1)  # five frames, fewer than are fitted
-    assert offset_wander(optical, imu, alignment) is None
+    assert wandering(optical, imu, alignment) is None
     steady, imu = recording()
     monkeypatch.setattr(offset_change, "_WANDER_STRETCH_S", 0.6)
-    assert offset_wander(steady, imu, align_times(steady, imu)) is None
+    assert wandering(steady, imu, align_times(steady, imu)) is None

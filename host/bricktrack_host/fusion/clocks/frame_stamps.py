@@ -15,6 +15,7 @@ from bricktrack_host.fusion.clocks.offset_change import (
     SIGMA,
     OffsetChange,
     change_of_halves,
+    errors_of,
     offset_change,
     offset_wander,
 )
@@ -94,7 +95,8 @@ def check_stamps(
         problems.append(_step_words(step, frame, regularity.period_ns, change, verdict))
     spread_ns = max(levels_ns) - min(levels_ns)
     if not regularity.steps and imu is not None and alignment is not None:
-        change = change_of_halves(optical, imu, alignment)
+        errors = errors_of(optical, imu, alignment)
+        change = None if errors is None else change_of_halves(errors)
         if change is not None and change.is_sure:
             is_contradicted, spread_ns = True, abs(change.change_s) * 1e9
             problems.append(
@@ -111,7 +113,7 @@ def check_stamps(
                 "that both saw, where crystals hold 100: one of the two is scaled. Poses are as unsure as "
                 f"the motion in the {spread_ns / 1e6:.1f} ms that come together to either end of the run"
             )
-        elif (wander := offset_wander(optical, imu, alignment)) is not None:
+        elif errors is not None and (wander := offset_wander(optical, alignment, errors)) is not None:
             is_contradicted, sd_ns = True, np.hypot(sd_ns, wander.sd_s * 1e9)
             problems.append(
                 f"the offset of IMU and camera wanders by {wander.rms_s * 1e3:.1f} ms (rms) within the run, "

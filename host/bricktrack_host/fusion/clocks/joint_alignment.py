@@ -11,7 +11,8 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
-from bricktrack_host.fusion.clocks.rotation_fit import DISPERSION_PRIOR_SD_S3, LOSS_PRIOR_SD_S2, MIN_POSES
+from bricktrack_host.fusion.clocks.posed_frames import MIN_POSES
+from bricktrack_host.fusion.clocks.rotation_fit import DISPERSION_PRIOR_SD_S3, LOSS_PRIOR_SD_S2, left_out_s2
 from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
 from bricktrack_host.fusion.inertial.attitude import Attitude
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
@@ -115,6 +116,8 @@ def align_jointly(
         filter_s = float(np.sqrt(loss_s2)) if has_filter else 0.0
         if np.abs(moved).max() < _STANDS_S and settled:
             break
+    for i in (0, 2):
+        covariance[i, i] += left_out_s2(covariance[i, 5], covariance[5, 5], float(step[5]))
     sd = np.sqrt(np.diagonal(covariance))
 
     def found(alignment: TimeAlignment, sensor: _Sensor, i: int) -> TimeAlignment:

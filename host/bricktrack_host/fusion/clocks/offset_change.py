@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray
-from bricktrack_host.fusion.clocks.rotation_fit import MIN_POSES, Fit, RotationFit
-from bricktrack_host.fusion.clocks.time_alignment import MIN_ROTATION_SD_RAD, TimeAlignment, has_pose
+from bricktrack_host.fusion.clocks.posed_frames import MIN_POSES, PosedFrames
+from bricktrack_host.fusion.clocks.rotation_errors import RotationErrors
+from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
+from bricktrack_host.fusion.clocks.time_alignment import TimeAlignment, has_pose, posed_frames
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.tracks import ImuTrack, OpticalTrack
@@ -87,22 +89,18 @@ def offset_change(
     return OffsetChange(change_s, float(np.sqrt(variance_s2)))
 
 
-def change_of_halves(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> OffsetChange | None:
+def change_of_halves(errors: RotationErrors) -> OffsetChange | None:
     """Return by how much the offset changes half-way, where either half may have a rate of its own.
 
     A gyro whose scale or axes are off by a per cent looks like it, where the brick turns far to one side:
-    they are free here. None as of `offset_change`.
+    they are free here. ``errors``: of the run, see `errors_of`. None where one half turns too little.
     """
-    if alignment.source != "data":
-        return None
-    frames = has_pose(optical)
-    fit, t_s = rotation_fit_of(optical, alignment, signal_of(imu, alignment), frames, _FREE_RATE_SD)
+    t_s = errors.frames.t_s
     since_s = t_s - t_s[len(t_s) // 2]
     is_later = (since_s >= 0).astype(np.float64)
-    found = fit.time_errors(
+    found = errors.time_errors(
         np.stack([np.ones(len(t_s)), since_s, is_later, is_later * since_s], axis=1),
         np.array([_UNKNOWN_S, _FREE_RATE_SD, _UNKNOWN_S, _FREE_RATE_SD]),
-        alignment.gyro_bias_radps,
     )
     if found is None or found[1][2, 2] > (0.5 * _UNKNOWN_S) ** 2:
         return None
@@ -134,19 +132,19 @@ class _Wander(NamedTuple):
     chi2: float
 
 
-def offset_wander(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> OffsetWander | None:
+def offset_wander(
+    optical: OpticalTrack, alignment: TimeAlignment, errors: RotationErrors
+) -> OffsetWander | None:
     """Return how the offset wanders, by the rotations that both saw; None where it does not, or none tells.
 
     Frames are timed by mid-exposure: an exposure that changes and is not the one stated shifts them by half
-    of what it changes by.
+    of what it changes by. ``errors``: of the run, see `errors_of`.
     """
-    if alignment.source != "data":
-        return None
-    seen, signal = has_pose(optical), signal_of(imu, alignment)
     since_ns = optical.t_ns - optical.t_ns[0]
     n_stretches = max(1, round(int(since_ns[-1]) * 1e-9 / _WANDER_STRETCH_S))
-    of_frame = since_ns * n_stretches // (since_ns[-1] + 1)
-    found = [_wander_of(optical, alignment, signal, seen & (of_frame == k)) for k in range(n_stretches)]
+    stretch = (since_ns * n_stretches // (since_ns[-1] + 1))[has_pose(optical)]
+    rate_sd = CLOCK_RATE_SD if alignment.sample_clock is None else _FREE_RATE_SD
+    found = [_wander_of(errors.some(stretch == k), rate_sd) for k in range(n_stretches)]
     told = [one for one in found if one is not None]
     if not told:
         return None
@@ -158,26 +156,23 @@ def offset_wander(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment
         return None
     rms_s = float(np.sqrt(np.average(off[telling] ** 2, weights=1 / own[telling])))
     sd_s = np.where(telling, np.hypot(off, np.sqrt(own)), rms_s)
-    imu_s = seconds_since(alignment.imu_time_ns(optical.t_ns), signal.epoch_ns)
+    imu_s = seconds_since(alignment.imu_time_ns(optical.t_ns), errors.epoch_ns)
     return OffsetWander(rms_s, np.interp(imu_s, knots_s, sd_s))
 
 
-def _wander_of(
-    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray
-) -> _Wander | None:
-    """Return how the offset wanders over a stretch of frames."""
-    if np.count_nonzero(frames) < MIN_POSES:
+def _wander_of(errors: RotationErrors, rate_sd: float) -> _Wander | None:
+    """Return how the offset wanders over a stretch of frames; ``rate_sd``: of a steady rate beside it."""
+    t_s = errors.frames.t_s
+    if len(t_s) < MIN_POSES:
         return None
-    fit, t_s = rotation_fit_of(optical, alignment, signal, frames, _FREE_RATE_SD)
     n = max(4, round((t_s[-1] - t_s[0]) / _WANDER_KNOT_S) + 1)
     knots_s = np.linspace(t_s[0], t_s[-1], n)
     hats = np.maximum(0.0, 1 - np.abs(t_s[:, None] - knots_s) / (knots_s[1] - knots_s[0]))
-    found = fit.time_errors(hats, np.full(n, _WANDER_SD_S), alignment.gyro_bias_radps)
+    found = errors.time_errors(hats, np.full(n, _WANDER_SD_S))
     if found is None:
         return None
     error, covariance = found
     line = np.stack([np.ones(n), knots_s - knots_s.mean()], axis=1)
-    rate_sd = CLOCK_RATE_SD if alignment.sample_clock is None else _FREE_RATE_SD
     steady = line @ np.diag([_UNKNOWN_S**2, rate_sd**2]) @ line.T
     beside = np.linalg.solve(covariance + steady, error)
     return _Wander(knots_s, error - steady @ beside, np.diagonal(covariance), float(error @ beside))
@@ -188,14 +183,21 @@ def signal_of(imu: ImuTrack, alignment: TimeAlignment) -> ImuSignal:
     return ImuSignal.from_track(alignment.restamped(imu), gyro_filter_s=alignment.gyro_filter_s)
 
 
-def rotation_fit_of(
-    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray, rate_sd: float
-) -> tuple[RotationFit, FloatArray]:
-    """Return the fit of some frames, and their times: those of the IMU by the alignment."""
+def errors_of(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) -> RotationErrors | None:
+    """Return the errors of a run's frames against the gyro; None where the motion tells no offset."""
+    if alignment.source != "data":
+        return None
+    signal = signal_of(imu, alignment)
+    frames = _in_imu_time(optical, alignment, signal, has_pose(optical))
+    return RotationErrors(frames, signal, alignment.gyro_bias_radps)
+
+
+def _in_imu_time(
+    optical: OpticalTrack, alignment: TimeAlignment, signal: ImuSignal, frames: BoolArray
+) -> PosedFrames:
+    """Return some frames at the IMU's time by the alignment."""
     t_s = seconds_since(alignment.imu_time_ns(optical.t_ns[frames]), signal.epoch_ns)
-    sd_rad = np.sqrt(np.trace(optical.covariance[frames][:, :3, :3], axis1=1, axis2=2) / 3)
-    sd_rad = np.maximum(sd_rad, MIN_ROTATION_SD_RAD)
-    return RotationFit(t_s, optical.R_camera_brick[frames], sd_rad, signal, skew_prior_sd=rate_sd), t_s
+    return posed_frames(optical, frames, t_s)
 
 
 def _offset(
@@ -205,6 +207,6 @@ def _offset(
     if not frames.any():
         return None
     # In IMU time by the alignment: what is left to find is zero where it holds.
-    solver, t_s = rotation_fit_of(optical, alignment, signal, frames, rate_sd)
-    fit = solver.solve(0.0)
-    return None if fit is None else (fit, float(0.5 * (t_s[0] + t_s[-1])))
+    posed = _in_imu_time(optical, alignment, signal, frames)
+    fit = RotationFit(posed, signal, skew_prior_sd=rate_sd).solve(0.0)
+    return None if fit is None else (fit, float(0.5 * (posed.t_s[0] + posed.t_s[-1])))

@@ -14,8 +14,9 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag
+from bricktrack_host.fusion.clocks.posed_frames import PosedFrames
 from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
-from bricktrack_host.fusion.clocks.saw_tooth import MIN_PAIRS, STEP_S, SawTooth, SawToothSearch
+from bricktrack_host.fusion.clocks.saw_tooth import MIN_PAIRS, STEP_S, AsRead, SawTooth, SawToothSearch
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.tracks import ImuTrack
 
@@ -70,27 +71,24 @@ class SampleClock:
 
 
 def find_sample_clock(
-    t_s: FloatArray, R: FloatArray, sd_rad: FloatArray, signal: ImuSignal, imu: ImuTrack, *, as_read: Fit
+    frames: PosedFrames, signal: ImuSignal, imu: ImuTrack, *, as_read: Fit
 ) -> SampleClock | None:
     """Return the sensor's own clock, or None where the stamps serve as well.
 
     Parameters
     ----------
-    t_s : ndarray, shape (n,)
-        Frames with a pose, camera time, seconds after the signal's epoch.
-    R : ndarray, shape (n, 3, 3)
-        Their attitudes.
-    sd_rad : ndarray, shape (n,)
+    frames : PosedFrames
+        Camera time, after the signal's epoch.
     signal : ImuSignal
         Of ``imu`` with its stamps as read.
     imu : ImuTrack
     as_read : Fit
         Of the attitudes to the gyro by those stamps.
     """
-    offset_s = as_read.offset_s
-    if len(t_s) <= MIN_PAIRS:
+    if len(frames.t_s) <= MIN_PAIRS:
         return None
-    search = SawToothSearch(t_s, R, sd_rad, signal, imu, offset_s=offset_s)
+    run = AsRead(frames, signal, imu, as_read.offset_s)
+    search = SawToothSearch(run)
     if search.n_pairs < MIN_PAIRS:
         return None
     way = search.coarse()
@@ -100,7 +98,7 @@ def find_sample_clock(
     if earned < (-_EARN if search.has_repeats else _EARN):
         return None
 
-    judge = _Judge(t_s, R, sd_rad, signal, imu, search, offset_s)
+    judge = _Judge(run, search)
     judge.hear(search.ways(way, rate_sd=STEP_S / search.span_s))
     if not judge.heard:
         return None
@@ -113,7 +111,7 @@ def find_sample_clock(
     if not search.has_repeats:
         # Stamps at a wrong rate are a straight line and no saw-tooth, and so is one that never wraps.
         read = np.flatnonzero((imu.flags & int(UNUSABLE)) == 0)
-        line = RotationFit(t_s, R, sd_rad, signal, skew_prior_sd=_ANY_RATE_SD).solve(offset_s) or as_read
+        line = RotationFit(frames, signal, skew_prior_sd=_ANY_RATE_SD).solve(run.offset_s) or as_read
         left = min(as_read.misfit, line.misfit) - fit.misfit
         if left < _EARN * fit.residual_sd**2 or (np.diff(clock.sample[read]) == np.diff(read)).all():
             return None
@@ -152,26 +150,16 @@ class _Judge:
     Saw-tooths differ in more than the sequence; but their rates and phases the fit sets right by itself.
     """
 
-    def __init__(
-        self,
-        t_s: FloatArray,
-        R: FloatArray,
-        sd_rad: FloatArray,
-        signal: ImuSignal,
-        imu: ImuTrack,
-        search: SawToothSearch,
-        offset_s: float,
-    ) -> None:
-        self._t_s, self._R, self._sd_rad = t_s, R, sd_rad
-        self._signal, self._imu, self._search, self._offset_s = signal, imu, search, offset_s
+    def __init__(self, run: AsRead, search: SawToothSearch) -> None:
+        self._run, self._search = run, search
         self.heard: list[_Heard] = []
 
     def clock(self, way: SawTooth, sample: IntArray) -> SampleClock:
         """Return the clock of a sequence."""
         period_ns = self._search.period_s * (1 + way.rate) * 1e9
         first_s = self._search.first_sample_s(way)
-        first_ns = self._signal.epoch_ns + round(first_s * 1e9 + float(sample[0]) * period_ns)
-        read = np.flatnonzero((self._imu.flags & int(UNUSABLE)) == 0)
+        first_ns = self._run.signal.epoch_ns + round(first_s * 1e9 + float(sample[0]) * period_ns)
+        read = np.flatnonzero((self._run.imu.flags & int(UNUSABLE)) == 0)
         skipped = np.maximum(np.diff(sample[read]) - np.diff(read), 0)
         return SampleClock(first_ns, period_ns, sample - sample[0], int(skipped.sum()))
 
@@ -191,10 +179,9 @@ class _Judge:
                     self.heard.append(new.led_to_by(way))
 
     def _fit(self, way: SawTooth, sample: IntArray) -> Fit | None:
-        restamped = ImuSignal.from_track(self.clock(way, sample).restamp(self._imu))
-        at_s = self._t_s + (self._signal.epoch_ns - restamped.epoch_ns) * 1e-9
-        solver = RotationFit(at_s, self._R, self._sd_rad, restamped, skew_prior_sd=RATE_SD)
-        return solver.solve(self._offset_s + way.lag_s)
+        run, restamped = self._run, ImuSignal.from_track(self.clock(way, sample).restamp(self._run.imu))
+        frames = run.frames.later_by((run.signal.epoch_ns - restamped.epoch_ns) * 1e-9)
+        return RotationFit(frames, restamped, skew_prior_sd=RATE_SD).solve(run.offset_s + way.lag_s)
 
     def costs(self) -> FloatArray:
         """Return the chi-square of all that was heard, by the attitudes and by the reads."""

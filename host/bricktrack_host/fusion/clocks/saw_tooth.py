@@ -13,6 +13,7 @@ import numpy as np
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.imu_records import ImuFlag
 from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_host.fusion.clocks.posed_frames import PosedFrames
 from bricktrack_host.fusion.clocks.saw_tooth_kernel import (
     least_optics_costs,
     likeliest_path,
@@ -77,31 +78,32 @@ class SawTooth:
     read_cost: float
 
 
-class SawToothSearch:
-    """The evidence of one run, and what it says of saw-tooths.
+@dataclass(frozen=True, slots=True, eq=False)
+class AsRead:
+    """A run by the stamps of its reads, in which a sensor's own clock is sought.
 
-    Parameters
+    Attributes
     ----------
-    t_s, R, sd_rad : ndarray
-        Frames with a pose: camera time after the signal's epoch, attitude, and sd of the attitude.
+    frames : PosedFrames
+        Camera time, after the signal's epoch.
     signal : ImuSignal
-        Of ``imu`` with the stamps of its reads.
+        Of ``imu``.
     imu : ImuTrack
     offset_s : float
         Stamps less camera time, coarsely.
     """
 
-    def __init__(
-        self,
-        t_s: FloatArray,
-        R: FloatArray,
-        sd_rad: FloatArray,
-        signal: ImuSignal,
-        imu: ImuTrack,
-        *,
-        offset_s: float,
-    ) -> None:
-        self._offset_s = offset_s
+    frames: PosedFrames
+    signal: ImuSignal
+    imu: ImuTrack
+    offset_s: float
+
+
+class SawToothSearch:
+    """The evidence of one run, and what it says of saw-tooths."""
+
+    def __init__(self, run: AsRead) -> None:
+        signal, imu = run.signal, run.imu
         self._read_s = seconds_since(imu.t_ns, signal.epoch_ns)
         self._is_repeat = (imu.flags & int(ImuFlag.REPEAT)) != 0
         self._fresh = usable_samples(imu)
@@ -121,16 +123,17 @@ class SawToothSearch:
         late_s = float(np.median(self._read_s - slot * self.period_s))
         self._slot = slot - slot[half]
         self._mid_s = late_s + float(slot[half]) * self.period_s
-        self._tabulate(t_s, R, sd_rad, signal)
+        self._tabulate(run.frames, signal, run.offset_s)
         self._weigh_kinks(imu)
 
-    def _tabulate(self, t_s: FloatArray, R: FloatArray, sd_rad: FloatArray, signal: ImuSignal) -> None:
+    def _tabulate(self, frames: PosedFrames, signal: ImuSignal, offset_s: float) -> None:
         """Tabulate the misfit of frame-to-frame rotations over offsets of camera time to stamps."""
+        t_s, R, sd_rad = frames.t_s, frames.R, frames.sd_rad
         dt = np.diff(t_s)
         pair = np.flatnonzero(dt < 1.5 * np.median(dt))
         n_side = int(np.ceil((self.period_s + _SIDE_S) / STEP_S))
         self._lags_s = np.arange(-n_side, n_side + 1) * STEP_S
-        begin = t_s[pair][:, None] + self._lags_s + self._offset_s
+        begin = t_s[pair][:, None] + self._lags_s + offset_s
         end = begin + dt[pair][:, None]
         whole = ~(signal.in_gap(begin) | signal.in_gap(end)).any(axis=1)
         pair, begin, end = pair[whole], begin[whole], end[whole]
@@ -149,7 +152,7 @@ class SawToothSearch:
         index, where = np.unique(np.floor((middle - middle[0]) / _BIN_S), return_inverse=True)
         self._cost = np.zeros((len(index), len(self._lags_s)))
         np.add.at(self._cost, where, chi2)
-        self._bin_s = np.bincount(where, middle) / np.bincount(where) + self._offset_s
+        self._bin_s = np.bincount(where, middle) / np.bincount(where) + offset_s
         self.span_s = max(float(self._bin_s[-1] - self._bin_s[0]), 1.0)
 
     def _weigh_kinks(self, imu: ImuTrack) -> None:

@@ -17,7 +17,8 @@ import numpy as np
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.clocks.offset_change import offset_change, signal_of
-from bricktrack_host.fusion.clocks.rotation_fit import MIN_POSES, correlate
+from bricktrack_host.fusion.clocks.posed_frames import MIN_POSES
+from bricktrack_host.fusion.clocks.rate_correlation import correlate
 from bricktrack_host.fusion.clocks.rotation_fit_kernel import integrated_attitudes
 from bricktrack_host.fusion.clocks.slip_search_kernel import (
     likeliest_shifts,

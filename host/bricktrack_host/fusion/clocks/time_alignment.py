@@ -12,14 +12,9 @@ import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, as_float_array
 from bricktrack_common.errors import ConfigError, TrackingError
-from bricktrack_host.fusion.clocks.rotation_fit import (
-    GRID_S,
-    MIN_POSES,
-    Fit,
-    RotationFit,
-    as_likely,
-    correlate,
-)
+from bricktrack_host.fusion.clocks.posed_frames import MIN_POSES, PosedFrames
+from bricktrack_host.fusion.clocks.rate_correlation import GRID_S, correlate
+from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit, as_likely
 from bricktrack_host.fusion.clocks.sample_clock import RATE_SD, SampleClock, find_sample_clock
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
@@ -118,6 +113,12 @@ def has_pose(optical: OpticalTrack) -> BoolArray:
     )
 
 
+def posed_frames(optical: OpticalTrack, seen: BoolArray, t_s: FloatArray) -> PosedFrames:
+    """Return some frames, all with a pose, for the fits; their times ``t_s`` after the samples' epoch."""
+    sd_rad = np.sqrt(np.trace(optical.covariance[seen][:, :3, :3], axis1=1, axis2=2) / 3)
+    return PosedFrames(t_s, optical.R_camera_brick[seen], np.maximum(sd_rad, MIN_ROTATION_SD_RAD))
+
+
 def align_times(
     optical: OpticalTrack,
     imu: ImuTrack,
@@ -198,13 +199,10 @@ def align_times(
     if seen.sum() < MIN_POSES:
         return from_stamps(f"only {seen.sum()} frames have a pose; {MIN_POSES} are needed")
     # Seconds after the IMU's first sample, frames in camera time: the offset is what lies between.
-    t_s = seconds_since(t_ns, signal.epoch_ns)
-    R = optical.R_camera_brick[seen]
-    sd_rad = np.sqrt(np.trace(optical.covariance[seen][:, :3, :3], axis1=1, axis2=2) / 3)
-    sd_rad = np.maximum(sd_rad, MIN_ROTATION_SD_RAD)
+    frames = posed_frames(optical, seen, seconds_since(t_ns, signal.epoch_ns))
     prior_s = prior_offset_ns * 1e-9
-    correlation = correlate(t_s, R, signal, centre_s=prior_s, max_offset_s=max_offset_s)
-    solver = RotationFit(t_s, R, sd_rad, signal, skew_prior_sd=skew_prior_sd)
+    correlation = correlate(frames.t_s, frames.R, signal, centre_s=prior_s, max_offset_s=max_offset_s)
+    solver = RotationFit(frames, signal, skew_prior_sd=skew_prior_sd)
     fits: list[Fit] = []
     for lag in correlation.candidates_s():
         # The first may go where it likes; another that leaves its own maximum comes to one found before.
@@ -217,7 +215,7 @@ def align_times(
     best = fits[0]
     own = None
     if not _is_restamped:
-        own = find_sample_clock(t_s, R, sd_rad, signal, imu, as_read=best)
+        own = find_sample_clock(frames, signal, imu, as_read=best)
     if own is not None:
         found = align_times(
             optical,
@@ -266,7 +264,7 @@ def align_times(
             break
         filter_s = float(np.sqrt(loss_s2))
         sharp = ImuSignal.from_track(imu, gyro_filter_s=filter_s)
-        again = RotationFit(t_s, R, sd_rad, sharp, skew_prior_sd=skew_prior_sd).solve(best.offset_s)
+        again = RotationFit(frames, sharp, skew_prior_sd=skew_prior_sd).solve(best.offset_s)
         if again is None:
             break
         best, gyro_filter_s = again, filter_s
