@@ -24,6 +24,7 @@ from numba import njit
 from numba.core.compiler_lock import global_compiler_lock
 
 import bricktrack_common
+from bricktrack_host.compiled_cache import QuickCache
 
 try:
     import fcntl
@@ -92,10 +93,10 @@ def compiled_inline(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 def _kept(function: Callable[_P, _R], **options: bool | set[str]) -> Callable[_P, _R]:
     folder = _folder(function.__code__.co_filename)
-    made: Any = njit(cache=True, nogil=True, error_model="numpy", **options)  # type: ignore[call-overload]
+    dispatcher: Any = njit(nogil=True, error_model="numpy", **options)(function)  # type: ignore[call-overload]
     with _NAMING:
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
-        dispatcher = made(function)
+        dispatcher._cache = QuickCache(function)  # type: ignore[no-untyped-call]
     dispatcher.compile = _one_at_a_time(dispatcher.compile, folder, function.__qualname__)
     return cast(Callable[_P, _R], dispatcher)
 
