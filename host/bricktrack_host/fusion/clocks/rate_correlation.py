@@ -49,29 +49,31 @@ def correlate(
     compared with the gyro's mean over the same interval.
     """
     dt = np.diff(t_s)
-    pair = dt < 1.5 * np.median(dt)
+    pair = np.flatnonzero(dt < 1.5 * np.median(dt))
     dt = dt[pair]
     optical = rvec_from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:])[pair] / dt[:, None]
     n_side = int(np.ceil(max_offset_s / GRID_S))
     lags = np.asarray(centre_s + np.arange(-n_side, n_side + 1) * GRID_S, dtype=np.float64)
     at = t_s + lags[:, None]
-    inertial = np.diff(signal.angle_at(at), axis=1)[:, pair] / dt[:, None]
+    inertial = np.diff(signal.angle_at(at), axis=1).take(pair, axis=1)
+    inertial /= dt[:, None]
     is_missing = signal.in_gap(at)
-    use = ~(is_missing[:, :-1] | is_missing[:, 1:])[:, pair]
+    use = ~(is_missing[:, :-1] | is_missing[:, 1:]).take(pair, axis=1)
     n_used = use.sum(axis=1)
     weight = use / np.maximum(n_used, 1)[:, None]
 
     def normalised(a: FloatArray, b: FloatArray) -> FloatArray:
-        """Return the correlation over pairs and components, for a (n, c) and b (lags, n, c)."""
-        a, b = a - a.mean(axis=0), b - b.mean(axis=1, keepdims=True)
-        mean_a, mean_b = weight @ a, np.einsum("ln,lnc->lc", weight, b)
+        """Return the correlation over pairs and components, for a (n, c) and b (lags, n, c), used up."""
+        a = a - a.mean(axis=0)
+        mean_a = weight @ a
+        b -= weight[:, None] @ b
         aa = weight @ (a * a).sum(axis=1) - (mean_a**2).sum(axis=1)
-        bb = np.einsum("ln,lnc,lnc->l", weight, b, b) - (mean_b**2).sum(axis=1)
-        ab = np.einsum("ln,nc,lnc->l", weight, a, b) - (mean_a * mean_b).sum(axis=1)
+        bb = np.einsum("ln,lnc,lnc->l", weight, b, b)
+        b *= weight[..., None]
+        ab = b.reshape(len(b), -1) @ a.ravel()
         ok = (n_used >= MIN_POSES) & (aa > 0) & (bb > 0)
         return np.asarray(np.where(ok, ab / np.sqrt(np.where(ok, aa * bb, 1.0)), np.nan))
 
-    speed = normalised(
-        np.linalg.norm(optical, axis=-1, keepdims=True), np.linalg.norm(inertial, axis=-1, keepdims=True)
-    )
+    size = np.sqrt(np.einsum("lnc,lnc->ln", inertial, inertial))[..., None]
+    speed = normalised(np.linalg.norm(optical, axis=-1, keepdims=True), size)
     return Correlation(lags, speed, normalised(optical, inertial))

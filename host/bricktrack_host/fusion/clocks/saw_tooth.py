@@ -28,6 +28,8 @@ from bricktrack_host.tracks import ImuTrack
 MIN_PAIRS = 60  # of frames side by side, for a search
 STEP_S = 0.0005  # of ages and offsets
 _GRID_STEPS = 2  # of the first search
+_FINER = 4  # steps of offsets in one of these, near the end
+_BEYOND = 12  # steps that a search near the end may go beyond the table
 _MAX_RATE_ERROR = 0.012  # of the sensor's oscillator
 _SIDE_S = 0.008  # how far beside the coarse offset, which is half a saw-tooth wrong
 _BIN_S = 0.1  # of frame-to-frame rotations summed before the search
@@ -223,7 +225,7 @@ class SawToothSearch:
         rates = step * np.arange(-n, n + 1, dtype=np.float64)
         cost, lag = least_optics_costs(
             self._cost, self._bin_s - self._mid_s, self._lags_s[0], STEP_S, self.period_s, rates, phases,
-            lags[0], _GRID_STEPS, len(lags),
+            np.full(len(phases), lags[0]), _GRID_STEPS, len(lags),
         )  # fmt: skip
         cost += self._slip_costs(rates, phases, STEP_S, entices=0.0)[0]
         r, i = np.unravel_index(int(np.argmin(cost)), cost.shape)
@@ -254,18 +256,22 @@ class SawToothSearch:
         # What a later phase takes away the offset gives back.
         back = near.lag_s + near.phase_s - phases
         back -= self.period_s * np.round((back - near.lag_s) / self.period_s)
-        lags = back[:, None] + np.arange(-1.0, 1.01, 0.25) * STEP_S
         rates = near.rate + rate_sd * np.linspace(-2, 2, 9)
-        slips, kinks = self._slip_costs(rates, phases, _READ_JITTER_S, entices=_KINK_TELLS)
-        costs, read_costs, lag_at = [], [], []
-        for k, rate in enumerate(rates):
-            cost = self._optics(rate, phases, lags)
-            j = np.argmin(cost, axis=1)
-            rows = np.arange(len(phases))
-            read_costs.append(slips[k] + self._repeat_cost(rate, phases))
-            costs.append(cost[rows, j] + read_costs[-1])
-            lag_at.append(lags[rows, j])
-        cost = np.array(costs)
+        # The table is linear between its columns, so a finer one says the same. Beyond it its ends hold.
+        n_columns = self._cost.shape[1]
+        columns = np.arange(-_BEYOND * _FINER, (n_columns - 1 + _BEYOND) * _FINER + 1) / _FINER
+        before = np.clip(columns.astype(np.int64), 0, n_columns - 2)
+        share = np.clip(columns - before, 0.0, 1.0)
+        finer = (1 - share) * self._cost[:, before] + share * self._cost[:, before + 1]
+        step_s, least = STEP_S / _FINER, back - STEP_S
+        cost, lag = least_optics_costs(
+            finer, self._bin_s - self._mid_s, self._lags_s[0] - _BEYOND * STEP_S, step_s, self.period_s,
+            rates, phases, least, 1, 2 * _FINER + 1,
+        )  # fmt: skip
+        lag_at = least + lag * step_s
+        read_costs, kinks = self._slip_costs(rates, phases, _READ_JITTER_S, entices=_KINK_TELLS)
+        read_costs += [self._repeat_cost(rate, phases) for rate in rates]
+        cost += read_costs
         out: list[SawTooth] = []
         seen: list[tuple[int, float]] = []
         for flat in np.argsort(cost, axis=None):
@@ -277,7 +283,7 @@ class SawToothSearch:
             if any(at[0] == k and abs(at[1] - p) < _APART_S for k, p in seen):
                 continue
             seen.append(at)
-            values = rates[i], phases[j], lag_at[i][j], cost[i, j], read_costs[i][j]
+            values = rates[i], phases[j], lag_at[i, j], cost[i, j], read_costs[i, j]
             out.append(SawTooth(*map(float, values)))
         return out
 

@@ -66,14 +66,14 @@ def least_optics_costs(
     period_s: float,
     rates: FloatArray,
     phases_s: FloatArray,
-    least_lag_s: float,
+    least_lags_s: FloatArray,
     stride: int,
     n_lags: int,
 ) -> tuple[FloatArray, IntArray]:
     """Return the least of `optics_cost` over lags, and at which lag, of rates and phases.
 
-    Each of shape (n_rates, n_phases). ``period_s`` is that of a sensor of rate 0; the lags are ``stride``
-    columns of the table apart, none beyond it.
+    Each of shape (n_rates, n_phases). ``period_s`` is that of a sensor of rate 0; the lags begin at
+    ``least_lags_s``, shape (n_phases,), and are ``stride`` columns of the table apart, none beyond it.
     """
     n_bins, n_table = table.shape
     n_phases = len(phases_s)
@@ -96,7 +96,7 @@ def least_optics_costs(
             row = ordered[m]
             for i in range(n_phases):
                 age = _age(phases_s[i] - since_mid_s[m] * rates[r], period_s * (1 + rates[r]))
-                column = (age + least_lag_s - first_lag_s) / lag_step_s
+                column = (age + least_lags_s[i] - first_lag_s) / lag_step_s
                 at = min(max(int(column), 0), last)
                 later = min(max(column - at, 0.0), 1.0)
                 earlier = 1.0 - later

@@ -11,6 +11,8 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_host.compiled import compiled_in_place
 from bricktrack_host.tracking.pose.spline_kernel import knot_slopes
 
+_NEAR = 8  # pieces: so many are passed sooner one by one than by halving
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CubicPieces:
@@ -69,12 +71,19 @@ def _evaluate(x: FloatArray, c: FloatArray, at: FloatArray, order: int, out: Flo
     n_powers = len(c)
     for k in range(len(at)):
         t = at[k]
-        if t < x[i] or (i < last and t >= x[i + 1]):  # instants mostly rise: the same piece, or the next
-            if i < last and x[i + 1] <= t < x[min(i + 2, last + 1)]:
+        if i < last and t >= x[i + 1]:  # instants mostly rise: one of the next pieces
+            stop = min(i + _NEAR, last)
+            while i < stop and t >= x[i + 1]:
                 i += 1
-            else:
-                i = min(max(np.searchsorted(x, t, side="right") - 1, 0), last)
+        if not (x[i] <= t and (i == last or t < x[i + 1])):
+            i = min(max(np.searchsorted(x, t, side="right") - 1, 0), last)
         h = t - x[i]
+        if order == 0:
+            u, v, w = c[0, i, 0], c[0, i, 1], c[0, i, 2]
+            for p in range(1, n_powers):
+                u, v, w = u * h + c[p, i, 0], v * h + c[p, i, 1], w * h + c[p, i, 2]
+            out[k, 0], out[k, 1], out[k, 2] = u, v, w
+            continue
         for axis in range(3):
             value = 0.0
             for p in range(n_powers - 1, order - 1, -1):
