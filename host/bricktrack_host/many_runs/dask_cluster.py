@@ -51,9 +51,9 @@ class DaskCluster:
     """
 
     # Each is several: the scheduler itself gives a work to another worker, three times unless it is told
-    # otherwise. It blames a death on all that the worker had been given, so the second attempt is for the
-    # innocent.
-    attempts = 2
+    # otherwise. It blames a death on all that the worker had been given: the second attempt is for the
+    # innocent, and the last, which is alone, for those who met another deadly one there.
+    attempts = 3
 
     def __init__(
         self, address: str, *, tls: TlsFiles | None = None, patience_s: float = _WITHOUT_WORKERS_S

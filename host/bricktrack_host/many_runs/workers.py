@@ -121,8 +121,9 @@ def do_all(
 ) -> Generator[Outcome[T], None, None]:
     """Have every work done, and yield what became of each as it ends.
 
-    A work whose worker dies is given out again, as often as its ``workers`` say. Closing the iterator, or an
-    exception such as `KeyboardInterrupt` in its consumer, stops the workers.
+    A work whose worker dies is given out again, as often as its ``workers`` say; the last time alone, after
+    all others, so that no other one's death is blamed on it and it has all memory. Closing the iterator, or
+    an exception such as `KeyboardInterrupt` in its consumer, stops the workers.
 
     Parameters
     ----------
@@ -137,16 +138,19 @@ def do_all(
         `Instead`. Failures are told by `BricktrackError`.
     """
     waiting = deque((index, 1, work_of) for index in range(n_works))
+    last_tries: deque[tuple[int, int, Callable[[int], Work[Any]]]] = deque()
     active: dict[Future[Attempt[Any]], tuple[int, int, Callable[[int], Work[Any]]]] = {}
     try:
-        while waiting or active:
+        while waiting or active or last_tries:
+            if not waiting and not active:
+                waiting.append(last_tries.popleft())
             try:
                 while waiting and len(active) < workers.room():
                     index, _, make = waiting[0]
                     future = workers.submit(make(index), progress(index))
                     active[future] = waiting.popleft()
             except WorkersGoneError as e:
-                for index, _, _ in [*active.values(), *waiting]:
+                for index, _, _ in [*active.values(), *waiting, *last_tries]:
                     yield Outcome(index, None, str(e))
                 return
             except BricktrackError as e:  # of `work_of`: what it is made of cannot be read
@@ -159,7 +163,8 @@ def do_all(
                     came = future.result()
                 except WorkerLostError as e:
                     if n_attempt < workers.attempts:
-                        waiting.append((index, n_attempt + 1, make))
+                        is_last = n_attempt + 1 == workers.attempts
+                        (last_tries if is_last else waiting).append((index, n_attempt + 1, make))
                     else:
                         yield Outcome(index, None, f"given up after {n_attempt} attempts: {e}")
                     continue

@@ -69,7 +69,7 @@ def test_a_killed_worker_loses_nothing_and_other_software_is_refused(tmp_path, m
         outcomes, _ = do(works, DaskCluster(local.scheduler_address))
         assert [outcomes[i].value for i in (0, 1, 3)] == ["done at last", "aa", "bb"]
         assert (
-            "given up after 2 attempts: 1 worker died under it, last tcp://127.0.0.1" in outcomes[2].failure
+            "given up after 3 attempts: 1 worker died under it, last tcp://127.0.0.1" in outcomes[2].failure
         )
 
         monkeypatch.setattr(software_identity, "code_sha256", lambda: "0123456789abcdef")

@@ -3,7 +3,9 @@
 import os
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import Future
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -17,7 +19,7 @@ from bricktrack_common.errors import ConfigError
 from bricktrack_host.many_runs import memory
 from bricktrack_host.many_runs.local_processes import LocalProcesses
 from bricktrack_host.many_runs.memory import container_memory_mb, default_workers
-from bricktrack_host.many_runs.workers import Instead, do_all
+from bricktrack_host.many_runs.workers import Attempt, Instead, WorkerLostError, do_all
 
 
 def as_it_came(index, value):
@@ -53,6 +55,46 @@ def test_each_run_gives_its_value_or_its_own_failure():
     assert all(h.stages == [("decode", 200)] for h in heard.values())
     assert heard[4].done[-1] == 200
     assert len(heard[4].done) == 100
+
+
+class OneFate:
+    """Workers of which two share a machine: it dies with both, whichever of them was deadly."""
+
+    attempts = 3
+
+    def __init__(self):
+        self._begun = []
+
+    def room(self):
+        return 2
+
+    def submit(self, what, progress):
+        future = Future()
+        self._begun.append((future, what))
+        if len(self._begun) == 1:
+            threading.Timer(0.05, self._end).start()
+        return future
+
+    def _end(self):
+        ended, self._begun = self._begun, []
+        dies = any(what == "deadly" for _, what in ended)
+        for future, what in ended:
+            if dies:
+                future.set_exception(WorkerLostError("its machine died"))
+            else:
+                future.set_result(Attempt(what))
+
+    def stop(self):
+        pass
+
+
+def test_a_run_that_met_deadly_ones_each_time_gets_its_last_try_alone():
+    works = ["deadly", "a", "deadly", "b", "c"]
+    outcomes = do_all(len(works), works.__getitem__, OneFate(), progress=lambda i: Heard(), finish=as_it_came)
+    came = {o.index: o for o in outcomes}
+    assert sorted(came) == [0, 1, 2, 3, 4]
+    assert [came[i].value for i in (1, 3, 4)] == ["a", "b", "c"]
+    assert all("given up after 3 attempts" in came[i].failure for i in (0, 2))
 
 
 def test_two_runs_are_at_work_at_once_in_processes_of_their_own(tmp_path):
