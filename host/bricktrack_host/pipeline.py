@@ -108,6 +108,7 @@ def process_run(
         from bricktrack_host.stages.writing import write_run
 
         observations = pictures.observations(lights, rays, brick, settings.segmentation)
+        del lights  # a third of a megabyte for each second recorded, which nobody needs any more
     problems += pictures.problems()
     result, fusions = solve_run(
         run, observations, calibration=calibrated, rays=rays, brick=brick, settings=settings,

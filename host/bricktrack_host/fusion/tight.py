@@ -121,7 +121,9 @@ def fuse_tight(
         lever_arm_m=np.asarray(lever_arm_mm, dtype=np.float64) * 1e-3, settings=settings,
     )  # fmt: skip
     del first  # memory holds one smoother
-    return tight_result(observations, item, pose_level, smoother.smooth(), settings)
+    done = smoother.smooth()
+    del smoother
+    return tight_result(observations, item, pose_level, done, settings)
 
 
 def tight_result(

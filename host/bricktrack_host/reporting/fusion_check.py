@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray
+from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.reporting.chart import Chart, panel_grid
 from bricktrack_host.reporting.chart_marks import band
@@ -20,26 +20,40 @@ CHECK_PREFIX = "pose_level_"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoFusions:
-    """One motion fused in two ways, at the same instants.
+    """How far two fusions of one motion are apart, at the same n instants in any order.
 
     Attributes
     ----------
-    by_leds, by_poses : FusedTrack
+    t_ns : ndarray of int64, shape (n,), camera time
+    shift_mm : ndarray, shape (n, 3), mm, camera axes
+    turn_rad : ndarray, shape (n, 3), rad, brick axes
+    allowed_sd : ndarray, shape (n, 6), of ``[dtheta rad, dt mm]``
+        By the covariances of both, as `fusion.cross_check` has it.
     """
 
-    by_leds: FusedTrack
-    by_poses: FusedTrack
+    t_ns: IntArray
+    shift_mm: FloatArray
+    turn_rad: FloatArray
+    allowed_sd: FloatArray
+
+    @classmethod
+    def of(cls, by_leds: FusedTrack, by_poses: FusedTrack) -> "TwoFusions":
+        """Return how far two tracks of the same instants are apart."""
+        turn = np.swapaxes(by_poses.R_camera_brick, 1, 2) @ by_leds.R_camera_brick
+        variances = (np.diagonal(one.covariance, axis1=1, axis2=2) for one in (by_leds, by_poses))
+        return cls(
+            by_leds.t_ns,
+            by_leds.t_camera_brick_mm - by_poses.t_camera_brick_mm,
+            rvec_from_matrix(turn),
+            np.asarray(np.sqrt(sum(variances))),
+        )
 
 
 def fusion_check_chart(result: RunResult, figures: KeyFigures, two: TwoFusions) -> Chart:
     """Return the difference of both motions over time, in the band that both covariances allow."""
-    order = np.argsort(two.by_leds.t_ns, kind="stable")
-    t_ns = two.by_leds.t_ns[order]
-    shift_mm = (two.by_leds.t_camera_brick_mm - two.by_poses.t_camera_brick_mm)[order]
-    turn = np.swapaxes(two.by_poses.R_camera_brick, 1, 2) @ two.by_leds.R_camera_brick
-    turn_deg = np.rad2deg(rvec_from_matrix(turn))
-    variances = (np.diagonal(one.covariance, axis1=1, axis2=2) for one in (two.by_leds, two.by_poses))
-    sd = np.sqrt(sum(variances))[order]  # allowed by both, as `fusion.cross_check` has it
+    order = np.argsort(two.t_ns, kind="stable")
+    t_ns, shift_mm, sd = two.t_ns[order], two.shift_mm[order], two.allowed_sd[order]
+    turn_deg = np.rad2deg(two.turn_rad)
     axis = TimeAxis.of(result)
     chart = panel_grid(2, height_in=3.6, legend=True)
     for (panel,), values, allowed, words in zip(

@@ -21,6 +21,7 @@ from bricktrack_host.calibration.rays.irt import TwoPlaneIrt
 _STEP = np.repeat([0.02, 2.0], 3)  # rad, mm
 _LEAST_LEDS = 4
 _LEAST_SHARE = 1e-4  # of the greatest variance; less than that is not kept
+_AT_ONCE = 1 << 14  # poses, whose weights are in memory together, 1 kB each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,10 +72,14 @@ class RayErrors:
 
     def _sum(self, products: FloatArray, R: FloatArray, t_mm: FloatArray) -> FloatArray:
         """Return the sums, shape (n, 6, 6), of `_products` of factors by 1 and by the way to n poses."""
-        way = self._way_to(R, t_mm)
-        weights = np.concatenate([np.ones((len(way), 1)), way], axis=1)
+        sums = np.empty((len(R), 6, 6))
         i, j = np.triu_indices(7)
-        return np.asarray(((weights[:, i] * weights[:, j]) @ products.reshape(-1, 36)).reshape(-1, 6, 6))
+        for start in range(0, len(R), _AT_ONCE):
+            now = slice(start, start + _AT_ONCE)
+            way = self._way_to(R[now], t_mm[now])
+            weights = np.concatenate([np.ones((len(way), 1)), way], axis=1)
+            sums[now] = ((weights[:, i] * weights[:, j]) @ products.reshape(-1, 36)).reshape(-1, 6, 6)
+        return sums
 
     def _way_to(self, R: FloatArray, t_mm: FloatArray) -> FloatArray:
         """Return the coordinates of the way from `about` to poses, shape (n, 6), to first order."""

@@ -21,6 +21,7 @@ _STILL_GYRO_RADPS = np.deg2rad(1.0)
 _STILL_ACC_MPS2 = 0.5
 _N_SD = 5.0
 _N_IN_A_ROW = 3
+_AT_ONCE = 1 << 14  # poses, whose covariances are worked on together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,6 +109,16 @@ class RestPose:
         covariance : ndarray, shape (n, 6, 6)
             Of these poses in the camera frame.
         """
+        total = np.empty((len(covariance), 6, 6))
+        for start in range(0, len(total), _AT_ONCE):
+            now = slice(start, start + _AT_ONCE)
+            total[now] = self._covariance_of(R_camera_brick[now], t_camera_brick_mm[now], covariance[now])
+        return total
+
+    def _covariance_of(
+        self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray, covariance: FloatArray
+    ) -> FloatArray:
+        """Return the same as `relative_covariance` of not too many poses: it takes 1 kB for each."""
         turned, moved_mm = self._seen_from_rest(R_camera_brick, t_camera_brick_mm)
         R_rest_camera = self.R_camera_rest.T
         of_turn = np.concatenate([-np.swapaxes(turned, 1, 2), skew(moved_mm)], axis=1)

@@ -231,34 +231,31 @@ def content_id(folder: Path, summary: str) -> str:
 def _write_files(result: RunResult, folder: Path) -> None:
     t0_ns = result.t0_ns
     metadata = _table_metadata(result)
-    tables: dict[str, Any] = {
-        "optical": optical_table(
-            result.optical,
-            result.observations,
-            t0_ns=t0_ns,
-            from_rest=result.from_rest.get("optical"),
-            edge_fit=result.edge_fit,
-            metadata=metadata,
-        ),
-        "fused": fused_table(
-            result.fused,
-            edge_index=result.edge_index,
-            t0_ns=t0_ns,
-            rest=result.rest,
-            from_rest=result.from_rest,
-            edge_fit=result.edge_fit,
-            metadata=metadata,
-        ),
-        "leds": leds_table(
-            result.observations, result.optical, result.led_names, t0_ns=t0_ns, metadata=metadata
-        ),
-    }
-    if result.imu is not None:
-        tables["imu"] = imu_table(result.imu, result.imu_camera_t_ns, t0_ns=t0_ns, metadata=metadata)
-    if result.edge_fit is not None:
-        tables["edges"] = edges_table(result.edge_fit, t0_ns=t0_ns, metadata=metadata)
-    for name, table in tables.items():
+    n_rows: dict[str, int] = {}
+
+    def write(name: str, table: Any) -> None:
         write_table(table, folder, name)
+        n_rows[name] = table.num_rows
+
+    # One after the other: a long run's are as large as all that they are made of.
+    optical = optical_table(
+        result.optical, result.observations, t0_ns=t0_ns, from_rest=result.from_rest.get("optical"),
+        edge_fit=result.edge_fit, metadata=metadata,
+    )  # fmt: skip
+    write("optical", optical)
+    fused = fused_table(
+        result.fused, edge_index=result.edge_index, t0_ns=t0_ns, rest=result.rest, from_rest=result.from_rest,
+        edge_fit=result.edge_fit, metadata=metadata,
+    )  # fmt: skip
+    write("fused", fused)
+    del optical, fused
+    leds = leds_table(result.observations, result.optical, result.led_names, t0_ns=t0_ns, metadata=metadata)
+    write("leds", leds)
+    del leds
+    if result.imu is not None:
+        write("imu", imu_table(result.imu, result.imu_camera_t_ns, t0_ns=t0_ns, metadata=metadata))
+    if result.edge_fit is not None:
+        write("edges", edges_table(result.edge_fit, t0_ns=t0_ns, metadata=metadata))
     summary = _Summary(
         run_id=result.manifest.run_id,
         unit=result.manifest.unit,
@@ -266,7 +263,7 @@ def _write_files(result: RunResult, folder: Path) -> None:
         problems=list(result.problems),
         led_names=list(result.led_names),
         conventions=CONVENTIONS,
-        tables={name: table.num_rows for name, table in tables.items()},
+        tables=n_rows,
         rest_pose=rest_entry(result.rest),
         square_wave=_square_wave(result.edge_fit),
         alignment=result.alignment,

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -52,7 +52,8 @@ def optical_table(
         (Column("frame", "1", "number of the frame record in the run"),
          pa.array(np.arange(len(optical.t_ns)))),
         *_time_columns(optical.t_ns, t0_ns, edge_fit),
-        *_pose_columns(optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance, from_rest),
+        *_pose_columns(optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance,
+                       None if from_rest is None else _Moved.of(from_rest)),
         (Column("n_leds", "1", "LEDs that the pose is of"), pa.array(n_used)),
         (Column("residual_rms_px", "px", "root of the mean squared distance, seen less predicted"),
          pa.array(rms_px)),
@@ -82,33 +83,42 @@ def fused_table(
     if not tracks:
         tracks, kinds = [_empty_track()], ["imu"]
 
-    def joined(name: str, of: Sequence[FusedTrack | FromRest] = tracks) -> Any:
-        return np.concatenate([getattr(one, name) for one in of])
-
     kind_of = np.repeat(np.arange(len(kinds)), [len(track.t_ns) for track in tracks])
-    t_ns = joined("t_ns")
+    t_ns = np.concatenate([track.t_ns for track in tracks])
     order = np.lexsort((kind_of, t_ns))
+    row_of = np.empty_like(order)
+    row_of[order] = np.arange(len(order))
+    ends = np.cumsum([len(track.t_ns) for track in tracks])[:-1]
+
+    def in_order(parts: Sequence[Any]) -> Any:
+        """Return arrays of all kinds as one, in order of time; of all that are large there is one copy."""
+        together = np.empty((len(order), *parts[0].shape[1:]), dtype=parts[0].dtype)
+        for rows, part in zip(np.split(row_of, ends), parts, strict=True):
+            together[rows] = part
+        return together
+
     number = np.full(len(t_ns), -1, dtype=np.int64)
     if "edge" in fused:
         number[kind_of == kinds.index("edge")] = edge_index
     is_edge = (number >= 0)[order]
-    omega = joined("omega_brick_radps")[order]
-    v_mmps = joined("v_camera_mmps")[order]
-    moved = [from_rest[kind] for kind in kinds if kind in from_rest]
-    seen = FromRest(*(joined(name, moved)[order] for name in ("R", "t_mm", "covariance"))) if moved else None
+    omega = in_order([track.omega_brick_radps for track in tracks])
+    v_mmps = in_order([track.v_camera_mmps for track in tracks])
+    moved = [_Moved.of(from_rest[kind]) for kind in kinds if kind in from_rest]
+    seen = _Moved(*(in_order(parts) for parts in zip(*moved, strict=True))) if moved else None
     columns: Columns = [
         (Column("kind", "", "what fixes the instant: imu (slot), frame (picture) or edge (square wave)"),
          pa.array([kinds[k] for k in kind_of[order]], type=pa.string())),
         (Column("edge_index", "1", "number of the rising edge, 0 at the first; empty in other rows"),
          pa.array(number[order], mask=~is_edge)),
         *_time_columns(t_ns[order], t0_ns, edge_fit),
-        *_pose_columns(joined("R_camera_brick")[order], joined("t_camera_brick_mm")[order],
-                       joined("covariance")[order], seen),
+        *_pose_columns(in_order([track.R_camera_brick for track in tracks]),
+                       in_order([track.t_camera_brick_mm for track in tracks]),
+                       in_order([track.covariance for track in tracks]), seen),
         *vector_columns("omega_{}_radps", "rad/s", "angular rate in brick axes", omega),
         *vector_columns("v_{}_mmps", "mm/s", "velocity of the first LED, camera axes", v_mmps),
         *vector_columns("dv_{}_mmps", "mm/s", "velocity of the first LED, brick axes at rest",
                          _turned(v_mmps, rest)),
-        *flag_columns(joined("flags")[order]),
+        *flag_columns(in_order([track.flags for track in tracks])),
     ]  # fmt: skip
     return make_table(columns, metadata)
 
@@ -198,14 +208,30 @@ def _time_columns(t_ns: IntArray, t0_ns: int | None, edge_fit: EdgeFit | None) -
     ]  # fmt: skip
 
 
+class _Moved(NamedTuple):
+    """Poses as seen from rest, shape (n, 3, 3) and (n, 3), with the sd of rotation, rad, and position, mm."""
+
+    R: FloatArray
+    t_mm: FloatArray
+    sd: FloatArray
+
+    @classmethod
+    def of(cls, seen: FromRest) -> "_Moved":
+        return cls(seen.R, seen.t_mm, _sd(seen.covariance))
+
+
+def _sd(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
+
+
 def _pose_columns(
-    R: FloatArray, t_mm: FloatArray, covariance: FloatArray, from_rest: FromRest | None
+    R: FloatArray, t_mm: FloatArray, covariance: FloatArray, from_rest: _Moved | None
 ) -> Columns:
     q = continuous_quaternions(quaternion_from_matrix(R))
+    sd = _sd(covariance)
     if from_rest is None:
-        from_rest = FromRest(*(np.full_like(values, np.nan) for values in (R, t_mm, covariance)))
-    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    d_sd = np.sqrt(np.diagonal(from_rest.covariance, axis1=1, axis2=2))
+        from_rest = _Moved(*(np.full_like(values, np.nan) for values in (R, t_mm, sd)))
+    d_sd = from_rest.sd
     return [
         *vector_columns("{}_mm", "mm", "position of the first LED, camera frame", t_mm),
         *(

@@ -278,12 +278,14 @@ def with_ray_errors(
     if errors is None:
         return optical, fused
 
-    def of(track: OpticalTrack | FusedTrack) -> FloatArray:
-        return errors.covariance(track.R_camera_brick, track.t_camera_brick_mm)
+    def widened(track: OpticalTrack | FusedTrack) -> FloatArray:
+        covariance = errors.covariance(track.R_camera_brick, track.t_camera_brick_mm)
+        covariance += track.covariance
+        return covariance
 
     return (
-        replace(optical, covariance=optical.covariance + of(optical)),
-        {kind: replace(track, covariance=track.covariance + of(track)) for kind, track in fused.items()},
+        replace(optical, covariance=widened(optical)),
+        {kind: replace(track, covariance=widened(track)) for kind, track in fused.items()},
     )
 
 

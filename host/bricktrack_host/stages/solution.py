@@ -162,7 +162,7 @@ def solve_run(
     )
     if fusion is None or fusion.pose_level is None:
         return result, None
-    return result, TwoFusions(fusion.track, fusion.pose_level)
+    return result, TwoFusions.of(fusion.track, fusion.pose_level)
 
 
 def _pose_at_rest(optical: OpticalTrack, rest: RestPose | None) -> Pose:

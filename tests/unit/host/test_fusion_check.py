@@ -30,7 +30,7 @@ def two_fusions(result):
     track = main_track(result)
     shift = np.zeros_like(track.t_camera_brick_mm)
     shift[:, 1] = 0.02
-    return TwoFusions(replace(track, t_camera_brick_mm=track.t_camera_brick_mm + shift), track)
+    return TwoFusions.of(replace(track, t_camera_brick_mm=track.t_camera_brick_mm + shift), track)
 
 
 def test_figures_stand_in_words_and_not_in_the_table_of_the_clocks(result):
