@@ -35,6 +35,10 @@ logger = logging.getLogger(__name__)
 SET_UP_TIMEOUT_S = 12.0
 _HANG_NS = 500_000_000
 _HANG_PERIODS = 20
+_GIVE_UP_NS = 5_000_000_000
+"""A bus that hung for a moment comes free again, a sampler that was ended does not."""
+_STALLED_NS = 250_000_000
+"""Between two looks: the whole unit stood still, and the sampler is given time to show that it lives."""
 _STOP_TIMEOUT_S = 1.0
 
 _context = multiprocessing.get_context("spawn")
@@ -101,6 +105,7 @@ class ImuReader:
         self._started_ns = 0
         self._seen_count = 0
         self._seen_at_ns = 0
+        self._looked_ns = 0
         self._status = ImuStatus(name=settings.name, samples=0, gaps=0)
 
     @property
@@ -137,12 +142,15 @@ class ImuReader:
     def poll(self, *, may_give_up: bool = True) -> None:
         """Take the sampler's messages and see whether it is alive and at work.
 
-        With ``may_give_up`` one that hangs is ended; without it may go on, and only `news` tells.
+        With ``may_give_up`` one that hangs for long is ended; without it may go on, and only `news` tells.
         """
         if self._problem or self._buffer is None:
             return
         self._take_messages()
         now = monotonic_ns()
+        if now - self._looked_ns > _STALLED_NS:
+            self._seen_at_ns = now
+        self._looked_ns = now
         if self._problem:
             pass
         elif not self._process.is_alive():
@@ -156,10 +164,9 @@ class ImuReader:
             if count != self._seen_count:
                 self._seen_count, self._seen_at_ns, self._stall_words = count, now, ""
                 self._look_for_reset(self._ready.facts.opr_mode)
-            elif now - self._seen_at_ns > max(_HANG_NS, _HANG_PERIODS * self._period_ns):
-                silent_s = (now - self._seen_at_ns) / 1e9
-                words = f"its sampler hangs: no slot for {silent_s:.1f} s; the bus may be stuck"
-                if may_give_up:
+            elif (silent_ns := now - self._seen_at_ns) > max(_HANG_NS, _HANG_PERIODS * self._period_ns):
+                words = f"its sampler hangs: no slot for {silent_ns / 1e9:.1f} s; the bus may be stuck"
+                if may_give_up and silent_ns > _GIVE_UP_NS:
                     self._problem = words
                 elif not self._stall_words:
                     self._stall_words = words

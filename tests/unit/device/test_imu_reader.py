@@ -65,6 +65,18 @@ def test_a_hanging_sampler_is_noticed_and_ended() -> None:
         reader.stop()
 
 
+def test_a_unit_that_stood_still_does_not_hold_its_sampler_to_be_hanging() -> None:
+    reader = reader_on(FakeBusOpener(hang_after=20, hang_s=1.0))
+    reader.start()
+    try:
+        poll_until(reader, lambda: reader.is_ready)
+        time.sleep(0.9)  # and so did the sampler
+        reader.poll()
+        assert reader.problem == "" and reader.news() == []
+    finally:
+        reader.stop()
+
+
 def test_a_sampler_that_hangs_for_a_while_in_a_run_goes_on_and_only_a_gap_is_left() -> None:
     reader = reader_on(FakeBusOpener(hang_after=20, hang_s=0.8))
     reader.start()
