@@ -62,7 +62,8 @@ class Watchdog:
         limit_s = MAX_SAVING_S if state == "saving" else MAX_BEAT_AGE_S
         if self._recorder.beat_age_s >= limit_s:
             return f"the recorder's thread made no progress for {limit_s:g} s"
-        if self._server.beat_age_s >= MAX_BEAT_AGE_S:
+        # A run is worth more than an answer: the server's thread is not waited for before it is on the card.
+        if state not in ("recording", "saving") and self._server.beat_age_s >= MAX_BEAT_AGE_S:
             return f"the server's thread made no progress for {MAX_BEAT_AGE_S:g} s"
         return self._recorder.restart_reason
 

@@ -55,6 +55,11 @@ def test_a_hanging_thread_or_a_lost_camera_starves_it_and_is_told_once(
     assert [words in r.message for r in caplog.records] == [True]
 
 
+@pytest.mark.parametrize("state", ["recording", "saving"])
+def test_a_run_is_not_given_up_for_a_server_that_hangs(told: list[str], state: DaemonState) -> None:
+    assert Watchdog(Recorder(state=state), Server(beat_age_s=1000)).feed()
+
+
 def test_a_slow_card_is_waited_for_and_work_that_goes_on_again_feeds_again(told: list[str]) -> None:
     recorder = Recorder(state="saving", beat_age_s=30)
     watchdog = Watchdog(recorder, Server())
