@@ -231,7 +231,9 @@ class Trigger:
             if self._armed_ns is None:
                 return
             off_ns = self._clock() - t_ns
-            if not -_MAX_STAMP_AHEAD_NS <= off_ns <= _MAX_STAMP_AGE_NS:
+            # A report may be late by any time that the unit stood still, but not from before it was armed.
+            may_be_old = off_ns <= _MAX_STAMP_AGE_NS or t_ns >= self._armed_ns
+            if off_ns < -_MAX_STAMP_AHEAD_NS or not may_be_old:
                 self._n_off_clock += 1
                 self._worst_off_ns = max(self._worst_off_ns, abs(off_ns))
                 return

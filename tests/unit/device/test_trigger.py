@@ -112,6 +112,18 @@ def test_a_stamp_off_the_monotonic_clock_is_refused_in_words() -> None:
     assert len(train.problems) == 1 and "CLOCK_MONOTONIC" in train.problems[0]
 
 
+def test_edges_that_a_unit_hears_of_after_it_stood_still_for_seconds_count() -> None:
+    line = Line()
+    t = line.arm()
+    for k in range(3):
+        line.edge(t + (10 + 20 * k) * MS, 1, reported_ns=t + 4000 * MS)
+    stale = t - 3000 * MS
+    line.edge(stale, 0, reported_ns=t + 4000 * MS)  # from before it was armed, or of another clock
+    train = line.trigger.disarm()
+    assert train.edges_ns == [t + (10 + 20 * k) * MS for k in range(3)]
+    assert len(train.problems) == 1 and "1 edges have stamps up to 7.000 s off" in train.problems[0]
+
+
 def test_a_late_callback_keeps_the_kernels_stamp() -> None:
     line = Line()
     t = line.arm()
