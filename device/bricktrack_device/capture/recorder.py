@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import BricktrackError, StorageError
-from bricktrack_common.wire_messages import Armed, DaemonState, Disarmed, Refusal
+from bricktrack_common.wire_messages import Armed, DaemonState, Disarmed
 from bricktrack_device.capture.arming import new_session
 from bricktrack_device.capture.black_box import BlackBox, black_box_folder
 from bricktrack_device.capture.commands import (
@@ -20,14 +20,19 @@ from bricktrack_device.capture.commands import (
     ArmCommand,
     Command,
     DisarmCommand,
+    Inbox,
     OtherWork,
+    put_unless_many,
     refusal_of,
+    refuse_all,
 )
 from bricktrack_device.capture.kept_run import KeptRun
+from bricktrack_device.capture.lost_sensors import LostSensors
 from bricktrack_device.capture.recorder_status import RecorderStatus, status_of
 from bricktrack_device.capture.room import disk_needed_bytes
 from bricktrack_device.capture.run_light import RunLight
 from bricktrack_device.capture.session import Session
+from bricktrack_device.capture.standing_order import ArmOrder, StandingOrder
 from bricktrack_device.capture.state_table import Cause, StateMachine
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.interfaces import Rig
@@ -60,14 +65,15 @@ class Recorder:
         self._rig = rig
         self._store = store
         self._machine = StateMachine()
-        # None only wakes the thread up.
-        self._inbox: queue.SimpleQueue[Command | None] = queue.SimpleQueue()
+        self._inbox: Inbox = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._stopping = threading.Event()
         self._session: Session | None = None
         self._black_box = BlackBox(black_box_folder(config))
         self._kept = KeptRun(store, rig, self._black_box)
+        self._order = StandingOrder(self._black_box.folder, config.unit.name)
         self._auto_arm = config.recording.auto_arm
+        self._lost = LostSensors()
         self._try_again_at = 0.0
         self._last_error = ""
         self._doing = ""
@@ -90,7 +96,7 @@ class Recorder:
 
     def arm(self, label: str, duration_s: float | None, answer: Answer) -> None:
         """Ask to arm; answered with `Armed` when the unit is ready, or a `Refusal`."""
-        self._inbox.put(ArmCommand(label, duration_s, answer))
+        self._inbox.put(ArmCommand(ArmOrder(label=label, duration_s=duration_s), answer))
 
     def disarm(self, answer: Answer) -> None:
         """Ask to go back to idle, or to leave a fault; answered with `Disarmed` or a `Refusal`."""
@@ -102,7 +108,7 @@ class Recorder:
         ``work`` calls `beat` while it waits and answers by itself; ``answer`` gets the `Refusal` if the unit
         is armed, records or saves, or the work raises. ``doing`` says in the status what is going on.
         """
-        self._inbox.put(OtherWork(doing, work, answer))
+        put_unless_many(self._inbox, OtherWork(doing, work, answer))
 
     @property
     def state(self) -> DaemonState:
@@ -137,6 +143,7 @@ class Recorder:
             self._light.put_out_leftovers()
         except Exception:
             logger.exception("a bug in putting the LEDs out")
+        self._order.take_up()
         while not self._stopping.is_set():
             self._last_beat = time.monotonic()
             try:
@@ -160,7 +167,8 @@ class Recorder:
     def _obey(self, command: Command) -> None:
         try:
             if isinstance(command, ArmCommand):
-                session = self._arm(command.label, command.duration_s)
+                session = self._arm(command.order)
+                self._order.note(command.order)
                 self._auto_arm = self._config.recording.auto_arm
                 command.answer(Armed(run_id=session.run_id, missing=[m[:2000] for m in session.missing]))
             elif isinstance(command, DisarmCommand):
@@ -168,11 +176,10 @@ class Recorder:
                 command.answer(Disarmed())
             else:
                 self._do(command)
-        except BricktrackError as e:
-            command.answer(refusal_of(e))
         except Exception as e:
             command.answer(refusal_of(e))
-            raise
+            if not isinstance(e, BricktrackError):
+                raise
 
     def _go_on(self) -> None:
         """Do what is due in the present state."""
@@ -185,10 +192,9 @@ class Recorder:
                     session.note_trigger()
                     self._black_box.begin(session.run_id, self._config.video_bytes(session.duration_s))
                     self._black_box.take_if_due(session.so_far)
-                elif not session.has_sensors:
-                    self._fail("no sensor is left: " + "; ".join(session.missing))
-                elif self._auto_arm and session.lost_required:
-                    self._fail(f"lost while armed: {session.lost_required}. The unit will arm itself again")
+                    self._order.forget()
+                elif words := self._lost.words(session, auto_arm=self._auto_arm):
+                    self._fail(words)
             elif self.state == "recording":
                 self._black_box.take_if_due(session.so_far)
                 if session.is_over(monotonic_ns()):
@@ -201,16 +207,23 @@ class Recorder:
                 self._save_again()
         elif self.state == "fault" and self._auto_arm:
             self._change("disarm")
-        elif self.state == "idle" and self._auto_arm:
+        elif self.state == "idle" and (self._order.left or self._auto_arm):
             self._try_again_at = time.monotonic() + _RETRY_S
             try:
-                self._arm(self._config.recording.label, None)
+                self._arm_by_itself()
             except BricktrackError as e:
                 self._note_error(f"cannot arm itself: {e}")
 
     # Arming and disarming
 
-    def _arm(self, label: str, duration_s: float | None) -> Session:
+    def _arm_by_itself(self) -> None:
+        left = self._order.left
+        session = self._arm(left or ArmOrder(label=self._config.recording.label, duration_s=None))
+        if left is not None:
+            session.note_armed_again()
+            self._order.note(left)
+
+    def _arm(self, order: ArmOrder) -> Session:
         self._machine.require("arm", run_id=self._run_id)
         self._doing = "arming"
         try:
@@ -219,8 +232,8 @@ class Recorder:
                 self._rig,
                 self._store,
                 self._black_box,
-                label=label,
-                duration_s=duration_s or self._config.recording.duration_s,
+                label=order.label,
+                duration_s=order.duration_s or self._config.recording.duration_s,
                 light=self._light,
                 beat=self.beat,
             )
@@ -233,6 +246,7 @@ class Recorder:
         finally:
             self._doing = ""
         self._last_error = ""
+        self._lost = LostSensors()
         self._change("arm")
         return session
 
@@ -244,6 +258,7 @@ class Recorder:
                     "no-space", f"run {self._kept.run_id} is still only in memory: {self._machine.reason}"
                 )
         self._auto_arm = False
+        self._order.forget()
         if self.state == "idle":
             return
         self._machine.require("disarm", run_id=self._run_id)
@@ -319,6 +334,7 @@ class Recorder:
                 seconds = (monotonic_ns() - (self._session.t0_ns or 0)) / 1e9
                 self._finish(interrupted=f"the daemon was stopped {seconds:.1f} s after t = 0")
             elif self.state == "armed":
+                self._order.forget()
                 self._close_session()
                 self._change("stop")
             elif self._kept.run_id:
@@ -330,10 +346,7 @@ class Recorder:
             self._light.put_out()
         if self._kept.run_id:
             logger.error("%s: %s", self._kept.run_id, self._kept.fate)
-        while not self._inbox.empty():
-            command = self._inbox.get()
-            if command is not None:
-                command.answer(Refusal(code="not-ready", message="the daemon is stopping"))
+        refuse_all(self._inbox, "the daemon is stopping")
 
     def _go_on_after(self, bug: Exception) -> None:
         """Go to fault after a bug, but not before a recording under way has ended and is on the card."""
@@ -356,6 +369,7 @@ class Recorder:
         """Go to fault from wherever the unit is."""
         self._try_again_at = time.monotonic() + _RETRY_S
         self._note_error(reason)
+        self._order.forget()
         self._close_session()
         self._change("failure", reason=reason)
 

@@ -235,6 +235,13 @@ class Session:
         self._trigger_triplet = read_clock_triplet()
         self.log.add("first edge", t0_ns=self.t0_ns)
 
+    def note_armed_again(self) -> None:
+        """Say that the daemon was killed while armed, and armed again: the wave may have begun in between."""
+        self._note_missing(
+            "the daemon was killed while it was armed, and armed itself again: edges before that were not "
+            "heard, t = 0 may be a later one than the first"
+        )
+
     def note_bug(self, words: str) -> bool:
         """Note that the daemon itself went wrong, and tell whether that is new, and not one of very many."""
         if words in self.missing or self._n_bugs >= _MOST_BUGS:

@@ -99,7 +99,7 @@ def recover_runs(store: RunStore, black_box: Path | None = None) -> list[str]:
 def waiting_copies(black_box: Path | None) -> list[Path]:
     """Return what a killed daemon left in memory; nothing, and a word in the log, where it cannot be had."""
     try:
-        return sorted(black_box.iterdir()) if black_box is not None else []
+        return sorted(p for p in black_box.iterdir() if p.name[0] != ".") if black_box is not None else []
     except FileNotFoundError:  # it is made with the first run
         return []
     except OSError as e:

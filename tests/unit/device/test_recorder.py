@@ -8,6 +8,7 @@ from recorder_bench import MakeBench, wait_until
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Disarmed, Refusal
+from bricktrack_device.capture import lost_sensors
 from bricktrack_device.capture import recorder as recorder_module
 from bricktrack_device.capture import session as session_module
 from bricktrack_device.capture.session import Session
@@ -92,6 +93,7 @@ def test_a_unit_that_arms_itself_leaves_an_armed_state_that_lost_its_camera(
     bench: MakeBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder_module, "_RETRY_S", 0.05)
+    monkeypatch.setattr(lost_sensors, "PATIENCE_S", 0.2)
     camera = FakeCamera(silent_after=20)
     recording = RecordingTable(duration_s=0.5, pre_roll_s=0.2, post_roll_s=0.1, auto_arm=True)
     b = bench(rig=FakeRig(camera=camera), recording=recording, imu=[ImuTable(name="brick", bus="a")])
