@@ -141,9 +141,7 @@ def observe_lights(
         out.cov_px2[i, leds] = blobs.cov_px2[index]
         out.area_px2[i, leds] = blobs.area_px2[index]
         out.led_flags[i, leds] = blobs.flags[index]
-    out.led_flags[found.is_strayed] |= int(LedFlag.PARTLY_COVERED)
-    R, t = found.R_camera_brick, found.t_camera_brick_mm
-    _flag_areas(out, R, t, ray_model, brick_model)
+    _flag_areas(out, found, ray_model, brick_model)
     _widen_blurred(out)
     seen = all_finite(out.uv_px)
     covered = np.zeros(seen.shape, dtype=bool)
@@ -165,21 +163,23 @@ def _frame_flags(found: Identities, i: int) -> int:
 
 
 def _flag_areas(
-    out: LedObservations, R: FloatArray, t: FloatArray, ray_model: RayModel, brick_model: BrickModel
+    out: LedObservations, found: Identities, ray_model: RayModel, brick_model: BrickModel
 ) -> None:
     """Flag LEDs whose area is not what they show in the rest of the run, given the pose.
 
-    Those that are whole, but look other than they do from there, are doubted by as much.
+    Those that are whole, but look other than they do from there, are doubted by as much. Lights that strayed
+    from where their pose has them are flagged too, unless they look as they always do: then it is the brick
+    that was jolted while the rows were read, and the LEDs left out would be as good a choice as those kept.
     """
-    posed = np.flatnonzero(all_finite(R, 2))
+    posed = np.flatnonzero(all_finite(found.R_camera_brick, 2))
     if posed.size == 0:
         return
+    R, t, strayed = found.R_camera_brick[posed], found.t_camera_brick_mm[posed], found.is_strayed[posed]
     # Bare profile where none was fitted: the ratio to the run's median takes the difference off.
-    prediction, _ = predict_brick(
-        R[posed], t[posed], ray_model, brick_model, collar_mm=collar_of(brick_model) or 0.0
-    )
+    prediction, _ = predict_brick(R, t, ray_model, brick_model, collar_mm=collar_of(brick_model) or 0.0)
     ratio = np.log(out.area_px2[posed] / prediction.area_px2)
-    usable = np.isfinite(ratio) & ((out.led_flags[posed] & NOT_USED) == 0)
+    measured = np.isfinite(ratio) & ((out.led_flags[posed] & NOT_USED) == 0)
+    usable = measured & ~strayed
     usual = _median_or_nan(ratio, usable)
     usual_of_all = float(np.nanmedian(usual)) if np.isfinite(usual).any() else 0.0
     # An LED covered in most of the run would set its own standard: then the others' holds.
@@ -195,9 +195,10 @@ def _flag_areas(
     with np.errstate(invalid="ignore"):
         flags[deviation < -limit] |= LedFlag.PARTLY_COVERED
         flags[deviation > 2 * limit] |= LedFlag.MERGED
+        flags[strayed & ~(np.abs(deviation) <= limit)] |= LedFlag.PARTLY_COVERED
     out.led_flags[posed] = flags
-    whole = usable & ((flags & NOT_USED) == 0)
-    doubt = doubt_by_shape(ratio, out.cov_px2[posed], whole, R[posed], t[posed])
+    whole = measured & ((flags & NOT_USED) == 0)
+    doubt = doubt_by_shape(ratio, out.cov_px2[posed], whole, R, t)
     doubt_px2 = doubt**2 * out.area_px2[posed] / np.pi
     out.cov_px2[posed] += np.where(whole, doubt_px2, 0.0)[..., None, None] * np.eye(2)
 

@@ -34,7 +34,8 @@ class Identities:
     is_ambiguous : ndarray of bool, shape (n,)
     is_strayed : ndarray of bool, shape (n, n_leds)
         The light is where the LED is seen, within the gate, but farther than its pose explains: what a card
-        or the border leaves of the LED, or another light. Not for poses.
+        or the border leaves of the LED, or another light; or a jolt moved it while the rows were read, which
+        its area tells.
     """
 
     blob_of_led: IntArray
