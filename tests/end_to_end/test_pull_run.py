@@ -393,3 +393,36 @@ def test_several_units_come_side_by_side_and_one_that_fails_does_not_stop_the_re
     ]  # fmt: skip
     assert [len(r.errors) for r in results] == [0, 1, 0]
     assert [len(r.runs) for r in results] == [2, 1, 2]
+
+
+def test_a_run_that_another_pull_brings_at_the_same_moment_is_here_once_and_whole(source, here, monkeypatch):
+    opened = part_folder.PartFolder.open
+
+    def other_is_faster(path, description, *, note):
+        monkeypatch.setattr(part_folder.PartFolder, "open", opened)
+        with FakeUnit(source.parent) as other:
+            assert pull(other, here).outcome == "pulled"
+        return opened(path, description, note=note)
+
+    monkeypatch.setattr(part_folder.PartFolder, "open", other_is_faster)
+    with FakeUnit(source.parent) as unit:
+        pulled = pull(unit, here)
+        assert unit.confirmed == {RUN}
+    assert pulled.outcome == "already here" and contents(here / RUN) == contents(source)
+    assert [p.name for p in here.iterdir()] == [RUN]
+
+
+def test_a_folder_that_got_its_final_name_while_its_lock_was_waited_for_is_not_taken_for_ours(
+    source, here, monkeypatch
+):
+    locked = part_folder.fcntl.flock
+
+    def renamed_before(descriptor, operation):
+        monkeypatch.setattr(part_folder.fcntl, "flock", locked)
+        (here / f"{RUN}.part").rename(here / "final")
+        locked(descriptor, operation)
+
+    monkeypatch.setattr(part_folder.fcntl, "flock", renamed_before)
+    with FakeUnit(source.parent) as unit:
+        pull(unit, here)
+    assert contents(here / RUN) == contents(source) and list((here / "final").iterdir()) == []

@@ -260,15 +260,19 @@ class PartFolder:
 
 def _make_locked(path: Path) -> int:
     """Make the folder if there is none, and return the handle that holds its lock."""
-    path.mkdir(exist_ok=True)
-    sync_folder(path.parent)
-    lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as e:
-        os.close(lock)
-        raise StorageError(f"{path}: another pull is at work here. Wait for it, or stop it") from e
-    return lock
+    while True:
+        path.mkdir(exist_ok=True)
+        sync_folder(path.parent)
+        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as e:
+            os.close(lock)
+            raise StorageError(f"{path}: another pull is at work here. Wait for it, or stop it") from e
+        with suppress(FileNotFoundError):
+            if os.path.samestat(path.stat(), os.fstat(lock)):
+                return lock
+        os.close(lock)  # it got its final name between the opening and the locking
 
 
 def write_at(handle: BinaryIO, offset: int, data: bytes) -> None:

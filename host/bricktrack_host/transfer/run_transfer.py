@@ -204,6 +204,10 @@ class _RunTransfer:
         remedy = "What came is kept: make room or choose another folder with -o, then pull again"
         with storage_errors(self.part_path, remedy):
             with PartFolder.open(self.part_path, description, note=self._note) as part:
+                if self.folder.exists():  # another pull has brought it since we looked
+                    shutil.rmtree(part.path)
+                    self._check_present(description)
+                    return
                 self._tell(part.n_bytes_verified)
                 self._check_room(part)
                 for index, file in enumerate(description.files):
@@ -211,7 +215,7 @@ class _RunTransfer:
                     if index == 0:
                         self._check_manifest(part.path / file.name, description)
                 part.finish()
-            rename_durably(self.part_path, self.folder)
+                rename_durably(self.part_path, self.folder)  # while nobody else can begin to work there
             self._was_fetched = True
             PartFolder.forget_journal(self.folder)
 
