@@ -74,8 +74,16 @@ def _parameters(command: Any, context: Any) -> str:
         record = parameter.get_help_record(context)
         if record and "--help" not in parameter.opts:
             names, text = record
-            items.append(f"`{' '.join(names.split())}`\n: {_escaped(' '.join(text.split())) or 'See above.'}")
+            items.append(f"`{_plain(names)}`\n: {_escaped(_plain(text)) or 'See above.'}")
     return "\n\n".join(items)
+
+
+def _plain(text: str) -> str:
+    """Return types and limits in the words that ``--help`` has for them."""
+    text = re.sub(r"<list\[(\w+)\]>", r"<\1>", " ".join(text.split())).replace(" range>", ">")
+    text = text.replace("<str>", "<text>").replace("<Path>", "<path>").replace(" <bool>", "")
+    text = re.sub(r"([-\d.]+)<=x<=([-\d.]+)", r"\1 to \2", text)
+    return re.sub(r"x>=([-\d.]+)", r"at least \1", re.sub(r"x<=([-\d.]+)", r"at most \1", text))
 
 
 def _escaped(text: str) -> str:
