@@ -42,6 +42,14 @@ class StandingOrder:
         # No name of a run: it begins with a dot.
         self._path = None if folder is None else folder / f".armed-{unit}.json"
 
+    @property
+    def is_kept(self) -> bool:
+        """Whether there is one, or a killed daemon left one that nobody has taken up."""
+        try:
+            return self._path is not None and self._path.exists()
+        except OSError:
+            return False
+
     def note(self, order: ArmOrder) -> None:
         """Keep an order, in place of another one."""
         self.left = None

@@ -45,8 +45,10 @@ from bricktrack_common.wire_messages import (
     StillImage,
     TakeStill,
 )
+from bricktrack_device.capture.standing_order import ArmOrder, StandingOrder
 from bricktrack_device.config import DeviceConfig, RecordingTable, ServerTable, StorageTable, UnitTable
 from bricktrack_device.daemon import STOP_SIGNALS, Daemon
+from bricktrack_device.health.watch import HealthWatch
 from bricktrack_device.interfaces import Still
 from bricktrack_device.storage.disk import Disk
 
@@ -193,6 +195,20 @@ def test_on_a_card_that_can_only_be_read_runs_are_served_and_none_is_promised(
         assert (store.runs / f"{run_id}_cut.partial").exists()
         monkeypatch.undo()  # put right while the daemon runs
         assert isinstance(unit.ask(Arm(label="again"))[0], Armed)
+
+
+def test_a_daemon_that_was_killed_while_armed_arms_before_it_tries_its_sensors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = []
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    monkeypatch.setattr(HealthWatch, "test_hardware", lambda *a: tried.append(a))
+    StandingOrder(tmp_path / "black-box", "unit-1").note(ArmOrder(label="impact", duration_s=None))
+    with closing(Unit(tmp_path / "card")) as unit:
+        unit.wait(lambda: unit.status().state == "armed")
+        assert unit.status().run_id.endswith("_impact") and tried == []
+    with closing(Unit(tmp_path / "card")) as unit:  # it was ended on purpose
+        assert unit.status().state == "idle" and len(tried) == 1
 
 
 def test_disarm_answers_and_unknown_runs_are_refused(unit: Unit) -> None:
