@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bricktrack_common.arrays import BoolArray, FloatArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.brick_model import BrickModel
 from bricktrack_common.camera_model import RayModel
 from bricktrack_common.errors import TrackingError
@@ -35,7 +35,7 @@ from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run, build
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, relinearised
 from bricktrack_host.fusion.smoothing.linearisation import Linearisation
-from bricktrack_host.fusion.smoothing.smoother import POS, Filter, Problem
+from bricktrack_host.fusion.smoothing.smoother import POS, SEEN, Filter, Problem
 from bricktrack_host.fusion.smoothing.standing_doubt import Doubt
 
 _MOST_PASSES = 5
@@ -47,6 +47,7 @@ _PICTURES_HOLD_PX = 0.2
 """Within which a picture moves in proportion to the motion, of focal lengths about 1500 px: the square leaves
 0.0001 px, and of the few that move by a pixel, at impacts, 0.003 px."""
 _HELD_SHARE = 0.99
+_NONE = SEEN[:0]
 _GATE_CHI2 = 20.7  # of 2 degrees of freedom; passed by all but one in 30 000
 
 
@@ -177,14 +178,16 @@ class LedSmoother:
         """
         i = 1
         while True:
-            done = self._pass(self._prepared(chooses_noise=i == _NOISE_CHOSEN_IN))
+            may_stand = i > _NOISE_CHOSEN_IN  # before, nobody asks how sure the motion is
+            ready = self._prepared(chooses_noise=i == _NOISE_CHOSEN_IN)
+            done = self._pass(ready, of=SEEN if may_stand else _NONE)
             way, errors = self._errors_after(done)
-            stands = i > _NOISE_CHOSEN_IN and _moved_sds(self._origin_m, done.states) < _STANDS_SDS
+            stands = may_stand and _moved_sds(self._origin_m, done.states) < _STANDS_SDS
             if stands or i == _MOST_PASSES:
                 return self._with_doubt(done, way.doubt(errors, done.states.estimate.of), errors)
             self._learn(done, errors)
             i += 1
-            del done, way
+            del ready, done, way
 
     def _with_doubt(self, done: _Pass, doubt: Doubt, errors: StandingErrors) -> SmoothedLeds:
         """Return what came of a pass, with what the errors that stand still leave unsure."""
@@ -242,10 +245,10 @@ class LedSmoother:
         gyro_var, acc_var = of_steps.gyro(gyro)[:, None], of_steps.acc(acc)[:, None]
         return replace(ready, problem=replace(problem, gyro_var=gyro_var, acc_var=acc_var, leds=leds))
 
-    def _pass(self, ready: _Ready) -> _Pass:
-        """Smooth once."""
+    def _pass(self, ready: _Ready, *, of: IntArray) -> _Pass:
+        """Smooth once, with the covariance of the states ``of``."""
         passed, (used, scale, chi2) = Filter(ready.problem), self._of_poses
-        estimate = passed.smooth()
+        estimate = passed.smooth(of)
         states = Smoothed(
             ready.run, ready.nodes, ready.lin, ready.problem, passed, estimate, 0, used=used, scale=scale,
             levels=self._belief.levels, chi2=chi2, doubt=None,
