@@ -1,6 +1,6 @@
 """The smoother LED by LED: pictures predicted, noise and standing errors found, and once more from there."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -99,7 +99,10 @@ class _Belief:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Ready:
-    """All that a pass needs; ``pictured`` is without the errors that stand still."""
+    """All that a pass needs; ``pictured`` is without the errors that stand still.
+
+    ``of``: the states whose covariance it gives, as of `Estimate`.
+    """
 
     pictured: Pictured
     use: BoolArray
@@ -107,6 +110,7 @@ class _Ready:
     nodes: Nodes
     lin: Linearisation
     problem: Problem
+    of: IntArray = field(default_factory=lambda: SEEN)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +184,7 @@ class LedSmoother:
         while True:
             may_stand = i > _NOISE_CHOSEN_IN  # before, nobody asks how sure the motion is
             ready = self._prepared(chooses_noise=i == _NOISE_CHOSEN_IN)
-            done = self._pass(ready, of=SEEN if may_stand else _NONE)
+            done = self._pass(ready if may_stand else replace(ready, of=_NONE))
             way, errors = self._errors_after(done)
             stands = may_stand and _moved_sds(self._origin_m, done.states) < _STANDS_SDS
             if stands or i == _MOST_PASSES:
@@ -245,10 +249,10 @@ class LedSmoother:
         gyro_var, acc_var = of_steps.gyro(gyro)[:, None], of_steps.acc(acc)[:, None]
         return replace(ready, problem=replace(problem, gyro_var=gyro_var, acc_var=acc_var, leds=leds))
 
-    def _pass(self, ready: _Ready, *, of: IntArray) -> _Pass:
-        """Smooth once, with the covariance of the states ``of``."""
+    def _pass(self, ready: _Ready) -> _Pass:
+        """Smooth once."""
         passed, (used, scale, chi2) = Filter(ready.problem), self._of_poses
-        estimate = passed.smooth(of)
+        estimate = passed.smooth(ready.of)
         states = Smoothed(
             ready.run, ready.nodes, ready.lin, ready.problem, passed, estimate, 0, used=used, scale=scale,
             levels=self._belief.levels, chi2=chi2, doubt=None,
