@@ -1,5 +1,6 @@
 """How far the processing of a run is, and how long its stages took."""
 
+import ctypes
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,9 +40,21 @@ class Stages:
     @contextmanager
     def __call__(self, name: str, total: int | None = None) -> Iterator[None]:
         """Surround a stage."""
+        _give_back_memory()
         self.progress.stage(name, total)
         start = time.perf_counter()
         try:
             yield
         finally:
             self.seconds[name] = time.perf_counter() - start
+
+
+def _give_back_memory() -> None:
+    """Give the system what lies unused between what is used, where the C library can (glibc).
+
+    It would stay with the process, and the next stage's larger arrays would come on top of it.
+    """
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except (AttributeError, OSError, TypeError):  # another C library; TypeError: Windows
+        return
