@@ -7,6 +7,7 @@ import pytest
 from daemon_runs import simulate_run
 
 from bricktrack_common.brick_model import ProfileEntry
+from bricktrack_host.fusion.led_by_led import leds_among_themselves
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds, picture
 from bricktrack_host.fusion.led_by_led.leds_among_themselves import AmongThemselves
 from bricktrack_host.fusion.smoothing.observation_kernel import LedArrays
@@ -23,8 +24,11 @@ def run():
     )
 
 
-def measured(run, residual_px, *, is_used=None):
-    """Return the run's arrays, of which only these are looked at, with such residuals."""
+def measured(run, residual_px, *, is_used=None, by_view=None):
+    """Return what is measured of the run's arrays, of which only these are looked at, with such residuals.
+
+    ``by_view``: gives what each sight has of an LED's errors, shape (m, V), from LEDs; one of them all if None.
+    """
     leds = SeenLeds.of(run.observations, run.camera)
     track = solve_poses(run.observations, run.camera, run.brick)
     R, t_mm = track.R_camera_brick[leds.frame], track.t_camera_brick_mm[leds.frame]
@@ -36,7 +40,8 @@ def measured(run, residual_px, *, is_used=None):
         "cov_px2": np.broadcast_to(0.05**2 * np.eye(2), (m, 2, 2)),
         "residual_px": residual_px(leds, pictured),
     }
-    return AmongThemselves.of(LedArrays(**fields), leds, np.zeros((m, 2, 0)), 7)
+    views = np.ones((m, 1)) if by_view is None else by_view(leds)
+    return AmongThemselves.of(LedArrays(**fields), leds, np.zeros((m, 2, 0)), views, 7)
 
 
 def size_px(found):
@@ -89,3 +94,35 @@ def test_a_run_without_four_leds_in_a_frame_says_nothing(run):
     none = measured(run, lambda leds, _: np.ones((len(leds.led), 2)), is_used=lambda leds: leds.led < 3)
     assert not len(none.value)
     np.testing.assert_array_equal(none.belief(np.ones((3, 1, 1)) * np.eye(14), np.zeros(14)), np.zeros(3))
+
+
+def test_changes_with_the_view_are_measured_beside_what_stays(run):
+    rng = np.random.default_rng(3)
+    stays_px, change_px = rng.normal(0, 0.1, (7, 2)), rng.normal(0, 0.3, (7, 2))
+
+    def views(leds):
+        return np.stack([np.ones(len(leds.led)), np.sin(0.7 * leds.frame)], axis=1)
+
+    def off(leds, _):
+        changed = views(leds)[:, 1, None] * change_px[leds.led]
+        return stays_px[leds.led] + changed + rng.normal(0, 0.05, (len(leds.led), 2))
+
+    found = measured(run, off, by_view=views)
+    true_px = np.concatenate([stays_px.ravel(), change_px.ravel()])
+    assert len(found.value) == 16  # eight each: one pose of all frames, and one that changes so, are hidden
+    z = (found.value - found.by_error @ true_px) / found.noise_sd
+    assert np.abs(z).max() < 4  # sixteen, of noise as it was drawn
+    assert np.abs(found.value / found.noise_sd).max() > 30  # and there was something to find
+
+
+def test_frames_beyond_what_is_summed_at_once_count_as_well(run, monkeypatch):
+    def off(leds, _):
+        return np.random.default_rng(4).normal(0, 0.2, (len(leds.led), 2))
+
+    whole = measured(run, off)
+    monkeypatch.setattr(leds_among_themselves, "_FRAMES_AT_ONCE", 13)
+    parts = measured(run, off)
+    prior = SIZES_PX[:, None, None] ** 2 * np.eye(14)
+    np.testing.assert_allclose(
+        parts.belief(prior, np.zeros(14)), whole.belief(prior, np.zeros(14)), atol=1e-8
+    )

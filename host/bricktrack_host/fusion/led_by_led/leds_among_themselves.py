@@ -15,6 +15,7 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.smoothing.observation_kernel import LedArrays
 
+_FRAMES_AT_ONCE = 4096  # of more the products are only more memory
 _LEAST_LEDS = 4  # fewer hold a pose and say nothing more
 _LEAST_SEEN = 0.3
 """Share of an error that free poses leave. Of errors that look like poses a motion of ten degrees shows some
@@ -38,44 +39,40 @@ class AmongThemselves:
     noise_sd: FloatArray
 
     @classmethod
-    def of(cls, arrays: LedArrays, leds: SeenLeds, of_all: FloatArray, n_leds: int) -> "AmongThemselves":
+    def of(
+        cls, arrays: LedArrays, leds: SeenLeds, of_all: FloatArray, by_view: FloatArray, n_leds: int
+    ) -> "AmongThemselves":
         """Return what is measured in a run.
 
-        Of q = d + 2 L errors: those that all LEDs share move their pictures by ``of_all``, shape (m, 2, d);
-        then come (u, v) of each of ``n_leds``.
+        Of q = d + 2 V L errors: those that all LEDs share move their pictures by ``of_all``, shape (m, 2, d);
+        then come (u, v) of each of ``n_leds``, V times: as they stand, and as they change with the view. Of
+        each of these a sight has ``by_view``, shape (m, V).
         """
-        n_shared = of_all.shape[2]
-        q = n_shared + 2 * n_leds
+        n_shared, n_own = of_all.shape[2], 2 * by_view.shape[1] * n_leds
         n_in_frame = np.bincount(leds.frame[arrays.use], minlength=int(leds.frame.max(initial=0)) + 1)
         rows = np.flatnonzero(arrays.use & (n_in_frame[leds.frame] >= _LEAST_LEDS))
         if not rows.size:
-            return cls(np.zeros((0, q)), np.zeros(0), np.zeros(0))
+            return cls(np.zeros((0, n_shared + n_own)), np.zeros(0), np.zeros(0))
         weight = 1 / np.sqrt(0.5 * np.trace(arrays.cov_px2[rows], axis1=1, axis2=2))
-        led, (_, frame) = leds.led[rows], np.unique(leds.frame[rows], return_inverse=True)
-        whole = np.concatenate([arrays.J[rows], arrays.residual_px[rows, :, None]], axis=2)
-        seen = np.zeros((frame.max() + 1, n_leds, 2, 7))
-        seen[frame, led] = weight[:, None, None] * whole
-        seen = seen.reshape(-1, 2 * n_leds, 7)
-        weights = np.zeros((len(seen), n_leds))
-        weights[frame, led] = weight
-        weights = np.repeat(weights, 2, axis=1)
-        by_pose = np.linalg.qr(seen[..., :6])[0]
-        hidden = weights[..., None] * by_pose
-        total = (weights**2).sum(axis=0)
-        normal = np.diag(total) - np.einsum("fik,fjk->ij", hidden, hidden, optimize=True)
-        pull = (weights * seen[..., 6]).sum(axis=0)
-        pull -= np.einsum("fik,fjk,fj->i", hidden, by_pose, seen[..., 6], optimize=True)
-        root = np.sqrt(np.where(total > 0, total, 1.0))
-        share, ways = np.linalg.eigh(normal / np.outer(root, root))
+        whole = np.concatenate([arrays.J[rows], of_all[rows], arrays.residual_px[rows, :, None]], axis=2)
+        sums = _Sums(np.zeros((n_own, n_own)), np.zeros(n_own), np.zeros((n_own, n_shared + 1)))
+        numbers, frame = np.unique(leds.frame[rows], return_inverse=True)
+        for start in range(0, len(numbers), _FRAMES_AT_ONCE):
+            some = (frame >= start) & (frame < start + _FRAMES_AT_ONCE)
+            at = frame[some] - start, leds.led[rows[some]]
+            n_frames = int(at[0].max()) + 1
+            seen = np.zeros((n_frames, n_leds, 2, whole.shape[2]))
+            own = np.zeros((n_frames, n_leds, by_view.shape[1]))
+            seen[at] = weight[some, None, None] * whole[some]
+            own[at] = weight[some, None] * by_view[rows[some]]
+            sums.add(seen.reshape(n_frames, 2 * n_leds, -1), own.repeat(2, axis=1))
+        root = np.sqrt(np.where(sums.total > 0, sums.total, 1.0))
+        share, ways = np.linalg.eigh(sums.normal / np.outer(root, root))
         kept = share > _LEAST_SEEN
         share, ways = share[kept], ways[:, kept]
-        count = np.bincount(led, minlength=n_leds)
-        mean = np.zeros((2 * n_leds, q))
-        for i, moved in enumerate(of_all[rows].reshape(len(rows), 2 * n_shared).T):
-            mean[i // n_shared :: 2, i % n_shared] = np.bincount(led, moved, n_leds) / np.maximum(count, 1)
-        mean[:, n_shared:] = np.diag(np.repeat(count > 0, 2))
-        weighted = (ways * root[:, None]).T
-        return cls(weighted @ mean, ways.T @ (pull / root) / share, 1 / np.sqrt(share))
+        measured = (ways / root[:, None]).T @ sums.pull / share[:, None]
+        by_error = np.concatenate([measured[:, :n_shared], (ways * root[:, None]).T], axis=1)
+        return cls(by_error, measured[:, n_shared], 1 / np.sqrt(share))
 
     def belief(self, prior: FloatArray, known: FloatArray) -> FloatArray:
         """Return log-likelihoods of priors, shape (..., q, q), where ``known``, (q,), was taken out."""
@@ -85,3 +82,38 @@ class AmongThemselves:
         S = self.by_error @ prior @ self.by_error.T + np.diag(self.noise_sd**2)
         square = (off * np.linalg.solve(S, off[:, None])[..., 0]).sum(axis=-1)
         return np.asarray(-0.5 * (square + np.linalg.slogdet(S)[1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sums:
+    """Sums over frames, of n = 2 V L errors of LEDs' own.
+
+    Attributes
+    ----------
+    normal : ndarray, shape (n, n)
+        Of their least squares with the pose of each frame left free.
+    total : ndarray, shape (n,)
+        What its diagonal would be were all poses known.
+    pull : ndarray, shape (n, k)
+        Of what is seen.
+    """
+
+    normal: FloatArray
+    total: FloatArray
+    pull: FloatArray
+
+    def add(self, seen: FloatArray, own: FloatArray) -> None:
+        """Add f frames: ``seen``, shape (f, 2 L, 6 + k), by pose and what is seen; ``own``, (f, 2 L, V)."""
+        by_pose, target = np.linalg.qr(seen[..., :6])[0], seen[..., 6:]
+        free = target - by_pose @ (np.swapaxes(by_pose, 1, 2) @ target)
+        _, n_rows, n_views = own.shape
+        own = np.ascontiguousarray(own.transpose(2, 1, 0))
+        by_led = np.einsum("vif,uif->ivu", own, own)
+        by_sight = np.zeros((n_views, n_rows, n_views, n_rows))
+        i = np.arange(n_rows)
+        by_sight[:, i, :, i] = by_led
+        known = by_sight.reshape(self.normal.shape)
+        hidden = (own[..., None] * by_pose.transpose(1, 0, 2)).reshape(len(known), -1)
+        self.normal[:] += known - hidden @ hidden.T
+        self.total[:] += np.diag(known)
+        self.pull[:] += (own[:, :, None] @ free.transpose(1, 0, 2)).reshape(len(known), -1)

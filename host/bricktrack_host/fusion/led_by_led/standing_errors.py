@@ -54,6 +54,9 @@ _ALIKE_RAD = 0.2
 LEDs' errors changed by 5 to 10 times their size per radian (simulated)."""
 _OFFSET_SDS_PX = np.geomspace(0.005, 1.0, 30)
 """That single LEDs may be off by; any factor is as likely as the next before the run speaks."""
+_CHANGE_SDS_PX = np.geomspace(0.005, 1.0, 10)
+"""That they may change by within `_ALIKE_RAD`. It goes its own way: a misplaced LED's error hardly changes,
+what lens, light and coding do to an LED is another error some pixels further on."""
 _HIDDEN_SHARE = np.sqrt(2)
 """Of single LEDs' errors, what is believed over what they show among themselves. To the pictures that show it
 the shape of the LEDs was fitted, and often their places: what looks like a pose was left. Recordings by
@@ -160,16 +163,16 @@ class StandingPrior:
         camera_sd = camera_prior_sd(settings) if camera_moves else np.zeros(0)
         return cls(sensor_prior_sd(settings), np.stack(mean[3:], axis=1), shape_px2, camera_sd, n_views)
 
-    def covariance(self, offset_sd_px: ArrayLike) -> FloatArray:
+    def covariance(self, offset_sd_px: ArrayLike, change_sd_px: ArrayLike) -> FloatArray:
         """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...).
 
-        Without what is not estimated.
+        And where this changes with the view by ``change_sd_px``, shape (...). Without what is not estimated.
         """
         own = OWN_SHARE * self.led_shift_px
         last_led = _FIRST_LED + own.size
         by_view = slice(last_led, _FIRST_LED + self.n_views * own.size)
         q = by_view.stop + len(self.camera_sd)
-        out = np.zeros((*np.shape(offset_sd_px), q, q))
+        out = np.zeros((*np.broadcast_shapes(np.shape(offset_sd_px), np.shape(change_sd_px)), q, q))
         at = np.arange(q)
         of_all = [1.0, _SCALE_SD**2, 0.0, _SMEAR_SD**2]
         out[..., at, at] = np.concatenate(
@@ -182,7 +185,7 @@ class StandingPrior:
         out[..., of_leds[:, None], of_leds] += self.shape_px2
         out[..., of_leds, of_leds] += np.square(offset_sd_px)[..., None]
         of_profile = np.tile(np.repeat(0.5 * np.square(own).sum(axis=1), 2), self.n_views - 1)
-        out[..., at[by_view], at[by_view]] = np.square(offset_sd_px)[..., None] + of_profile
+        out[..., at[by_view], at[by_view]] = np.square(change_sd_px)[..., None] + of_profile
         return out
 
 
@@ -215,7 +218,8 @@ class StandingWay:
         if arrays is None:
             raise ValueError("the problem has no LEDs")
         of_all = _of_all_leds(pictured)
-        self._among_themselves = AmongThemselves.of(arrays, leds, of_all, n_leds)
+        views = _by_view(pictured, n_views)
+        self._among_themselves = AmongThemselves.of(arrays, leds, of_all, views, n_leds)
         camera, last = None, np.zeros((len(of_all), 2, 0))
         if R_still_camera is not None:
             camera = CameraWay.of(problem, R_still_camera, 0)
@@ -226,7 +230,7 @@ class StandingWay:
             first=np.ascontiguousarray(arrays.first[:, 0]),
             use=arrays.use,
             shared=np.concatenate([arrays.J[..., 3:] @ arrays.R_lin, -of_all], axis=2),
-            by_view=_by_view(pictured, n_views),
+            by_view=views,
             led=leds.led,
             n_leds=n_leds,
             last=last,
@@ -240,12 +244,17 @@ class StandingWay:
         """
         normal, pull = self._way.normal, self._way.pull
         n_leds = len(prior.led_shift_px)
-        part = slice(_PROFILE, _FIRST_LED + 2 * n_leds)
-        of_pictures = prior.covariance(_OFFSET_SDS_PX)[:, part, part]
-        belief = self._among_themselves.belief(of_pictures, known[part])
-        weight = np.exp(belief - belief.max())
-        offset_sd_px = float(np.sqrt((weight * _OFFSET_SDS_PX**2).sum() / weight.sum()))
-        believed = prior.covariance(_HIDDEN_SHARE * offset_sd_px)
+        part = slice(_PROFILE, _FIRST_LED + 2 * prior.n_views * n_leds)
+
+        def likely_px(sizes_px: FloatArray, of_pictures: FloatArray) -> float:
+            belief = self._among_themselves.belief(of_pictures[:, part, part], known[part])
+            weight = np.exp(belief - belief.max())
+            return float(np.sqrt((weight * sizes_px**2).sum() / weight.sum()))
+
+        # How large what stays is says nothing of how much changes.
+        change_sd_px = likely_px(_CHANGE_SDS_PX, prior.covariance(_OFFSET_SDS_PX[-1], _CHANGE_SDS_PX))
+        offset_sd_px = likely_px(_OFFSET_SDS_PX, prior.covariance(_OFFSET_SDS_PX, change_sd_px))
+        believed = prior.covariance(_HIDDEN_SHARE * offset_sd_px, _HIDDEN_SHARE * change_sd_px)
         _, value = _likeliest(believed, known, normal, pull)
         covariance = np.linalg.solve(np.eye(len(known)) + believed @ normal, believed)
         # What is not estimated draws the others after it.
