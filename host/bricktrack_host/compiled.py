@@ -24,7 +24,6 @@ from numba import njit
 from numba.core.compiler_lock import global_compiler_lock
 
 import bricktrack_common
-from bricktrack_host.compiled_cache import QuickCache
 
 try:
     import fcntl
@@ -35,6 +34,9 @@ logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 COMPILED_ROOT = Path(os.environ.get("NUMBA_CACHE_DIR") or Path.home() / ".cache" / "bricktrack" / "compiled")
+QUICK_WITH = ("0.68.1",)
+"""Versions of numba that `compiled_cache` was tested with: it rests on parts of it that may change any time. With
+others numba's own cache is used as it is."""
 _NAMING = Lock()
 """Numba takes a function's folder from a setting of the whole process; modules may be imported by threads."""
 PATIENCE_S = 600.0
@@ -96,7 +98,12 @@ def _kept(function: Callable[_P, _R], **options: bool | set[str]) -> Callable[_P
     dispatcher: Any = njit(nogil=True, error_model="numpy", **options)(function)  # type: ignore[call-overload]
     with _NAMING:
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
-        dispatcher._cache = QuickCache(function)  # type: ignore[no-untyped-call]
+        if numba.__version__ in QUICK_WITH:
+            from bricktrack_host.compiled_cache import QuickCache
+
+            dispatcher._cache = QuickCache(function)  # type: ignore[no-untyped-call]
+        else:
+            dispatcher.enable_caching()
     dispatcher.compile = _one_at_a_time(dispatcher.compile, folder, function.__qualname__)
     return cast(Callable[_P, _R], dispatcher)
 
@@ -158,7 +165,7 @@ def _wait_for(file: TextIO, path: Path) -> None:
 
 @cache
 def _folder(filename: str) -> Path:
-    held = hashlib.sha256()
+    held = hashlib.sha256(numba.__version__.encode())  # versions do not keep the same
     for source in sorted(sources_behind(Path(filename))):
         held.update(source.name.encode() + _read(source))
     return COMPILED_ROOT / held.hexdigest()[:16]

@@ -30,15 +30,18 @@ def how(function):
 """
 
 
-def told(tmp_path, *lines):
-    """Return what lines after `KERNELS` print, in a process of their own."""
+OTHER_NUMBA = "import numba; numba.__version__ = '0.99.0'"
+
+
+def told(tmp_path, *lines, before=""):
+    """Return what lines after `KERNELS` print, in a process of their own; ``before``: a line before them."""
     (tmp_path / "kernels.py").write_text(KERNELS)
     environment = {
         **os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)
     }  # fmt: skip
     done = subprocess.run(
-        [sys.executable, "-c", "\n".join(["from kernels import *", *lines])], cwd=tmp_path, env=environment,
-        capture_output=True, text=True, timeout=120, check=False,
+        [sys.executable, "-c", "\n".join([before, "from kernels import *", *lines])], cwd=tmp_path,
+        env=environment, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout.split("\n")[:-1]
@@ -67,3 +70,12 @@ def test_another_type_is_compiled_where_one_was_loaded(tmp_path):
     assert told(tmp_path, "print(doubled(values)[1], doubled(np.arange(3))[2], how(doubled))") == [
         "2.0 4.0 (1, 1)"
     ]
+
+
+def test_a_version_of_numba_that_is_not_known_uses_its_own_cache_beside_ours(tmp_path):
+    lines = ["print(doubled(values)[4], how(doubled), type(doubled._cache).__name__)"]
+    lines += ["print('bricktrack_host.compiled_cache' in sys.modules)"]
+    for before, name, quick in [("import sys", "QuickCache", True), (OTHER_NUMBA, "FunctionCache", False)]:
+        for how in ("(0, 1)", "(1, 0)"):  # compiled, then loaded: neither reads what the other keeps
+            expected = [f"8.0 {how} {name}", str(quick)]
+            assert told(tmp_path, "import sys", *lines, before=before) == expected
