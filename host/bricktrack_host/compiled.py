@@ -35,8 +35,8 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 COMPILED_ROOT = Path(os.environ.get("NUMBA_CACHE_DIR") or Path.home() / ".cache" / "bricktrack" / "compiled")
 QUICK_WITH = ("0.68.1",)
-"""Versions of numba that `compiled_cache` was tested with: it rests on parts of it that may change any time. With
-others numba's own cache is used as it is."""
+"""Versions of numba that `compiled_cache` was tested with: it rests on parts of it that may change any time.
+With others numba's own cache is used as it is."""
 _NAMING = Lock()
 """Numba takes a function's folder from a setting of the whole process; modules may be imported by threads."""
 PATIENCE_S = 600.0
