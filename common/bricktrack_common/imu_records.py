@@ -205,17 +205,18 @@ def decode_imu(description: ImuDescription, records: list[ImuRecord]) -> ImuSamp
     raw = np.zeros((n, N_DATA_BYTES), dtype=np.uint8)
     flags = np.full(n, int(ImuFlag.GAP), dtype=np.int64)
     mode_wrong = np.zeros(n, dtype=np.bool_)
-    wrong = False
+    wrong, since = False, 0
     for record in records:
         i = record.slot - first
         if record.status is not None and len(record.status) == 3:
-            wrong = record.status[2] != description.opr_mode
-        mode_wrong[i:] = wrong
+            mode_wrong[since:i] = wrong
+            wrong, since = record.status[2] != description.opr_mode, i
         if record.data is not None and record.t_after_ns - record.t_before_ns <= description.period_ns:
             raw[i] = np.frombuffer(record.data, dtype=np.uint8)
             t_ns[i] = (record.t_before_ns + record.t_after_ns) // 2 + description.latency_ns
             late = record.t_before_ns - t_due[i] > 2_000_000
             flags[i] = int(ImuFlag.LATE) if late else 0
+    mode_wrong[since:] = wrong
     words = raw.view("<i2").astype(np.float64)  # 23 words from register 0x08
     acc = words[:, 0:3] / description.acc_lsb_per_mps2
     gyro_dps = words[:, 6:9] / description.gyro_lsb_per_dps

@@ -119,6 +119,16 @@ def test_a_silent_reset_voids_the_samples_until_the_mode_is_right_again():
     assert np.isnan(s.acc_mps2[1:3]).all()
 
 
+def test_a_mode_holds_in_skipped_slots_and_until_the_end():
+    ok, reset = bytes([0, 0, 7]), bytes([0, 0, 0])
+    s = decode([
+        record(5, burst(0), status=reset), record(8, burst(1)), record(9, burst(2), status=ok),
+        record(10, burst(3), status=reset), record(12, burst(4)),
+    ])  # fmt: skip
+    changed = [bool(f & ImuFlag.MODE_CHANGED) for f in s.flags]
+    assert changed == [True, True, True, True, False, True, True, True]
+
+
 def test_a_torn_quaternion_is_not_believed_in_fusion_modes():
     ndof = ImuDescription(
         name="led", chip_id="", bus="sim", address=0x28, opr_mode=12, fusion=True, acc_range_g=4.0,
