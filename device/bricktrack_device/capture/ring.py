@@ -7,11 +7,12 @@ by time stamp, never by count: an encoder skips pictures and a callback runs ahe
 import threading
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
+from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.frame_times import FrameFlag, FrameRecord
 from bricktrack_device.interfaces import EncodedPacket, FrameMetadata
 
@@ -28,15 +29,20 @@ class FrameRing:
     Parameters
     ----------
     span_ns : int
-        How far back pictures are kept, counted from the newest.
+        How far back pictures are kept, counted from the newest by their stamps. None is held for longer than
+        this either: a camera whose stamps stand still fills no memory.
+    clock : callable
+        CLOCK_MONOTONIC, ns.
     """
 
-    def __init__(self, span_ns: int) -> None:
+    def __init__(self, span_ns: int, *, clock: Callable[[], int] = monotonic_ns) -> None:
+        self._clock = clock
         self._span_us = span_ns // 1000
         self._span_ns = span_ns
         self._lock = threading.Lock()
-        self._packets: deque[EncodedPacket] = deque()
-        self._metadata: deque[FrameMetadata] = deque()
+        # Each with when it came, ns.
+        self._packets: deque[tuple[int, EncodedPacket]] = deque()
+        self._metadata: deque[tuple[int, FrameMetadata]] = deque()
         self._first_abs_us: int | None = None
         self._first_keyframe_us: int | None = None
         self._n_bytes = 0
@@ -49,19 +55,21 @@ class FrameRing:
                 self._first_abs_us = packet.abs_us
             if packet.keyframe and self._first_keyframe_us is None:
                 self._first_keyframe_us = packet.abs_us
-            self._packets.append(packet)
+            now_ns = self._clock()
+            self._packets.append((now_ns, packet))
             self._n_packets += 1
             self._n_bytes += len(packet.data)
-            oldest_us = packet.abs_us - self._span_us
-            while self._packets[0].abs_us < oldest_us:
-                self._n_bytes -= len(self._packets.popleft().data)
+            oldest_us, earliest_ns = packet.abs_us - self._span_us, now_ns - self._span_ns
+            while self._packets[0][1].abs_us < oldest_us or self._packets[0][0] < earliest_ns:
+                self._n_bytes -= len(self._packets.popleft()[1].data)
 
     def on_metadata(self, metadata: FrameMetadata) -> None:
         """Keep one frame's metadata."""
         with self._lock:
-            self._metadata.append(metadata)
-            oldest_ns = metadata.sensor_timestamp_ns - self._span_ns
-            while self._metadata[0].sensor_timestamp_ns < oldest_ns:
+            now_ns = self._clock()
+            self._metadata.append((now_ns, metadata))
+            oldest_ns, earliest_ns = metadata.sensor_timestamp_ns - self._span_ns, now_ns - self._span_ns
+            while self._metadata[0][1].sensor_timestamp_ns < oldest_ns or self._metadata[0][0] < earliest_ns:
                 self._metadata.popleft()
 
     @property
@@ -88,12 +96,12 @@ class FrameRing:
     def newest_us(self) -> int | None:
         """Stamp of the newest picture, us."""
         with self._lock:
-            return self._packets[-1].abs_us if self._packets else None
+            return self._packets[-1][1].abs_us if self._packets else None
 
     def snapshot(self) -> tuple[list[EncodedPacket], list[FrameMetadata]]:
         """Return what is held now, oldest first."""
         with self._lock:
-            return list(self._packets), list(self._metadata)
+            return [p for _, p in self._packets], [m for _, m in self._metadata]
 
 
 @dataclass(frozen=True, slots=True)

@@ -131,6 +131,28 @@ def test_the_ring_forgets_by_time_and_counts_bytes() -> None:
     assert ring.newest_us == packets[-1].abs_us
 
 
+def test_a_camera_whose_stamps_stand_still_fills_no_memory() -> None:
+    now = [T_NS]
+    ring = FrameRing(10 * PERIOD_NS, clock=lambda: now[0])
+    packets, metadata = stream(50)
+    for i in range(50):
+        now[0] = at(i) + PERIOD_NS // 2  # each comes half a period after its stamp
+        ring.on_packet(packets[min(i, 30)])
+        ring.on_metadata(metadata[min(i, 30)])
+    held, of_frames = ring.snapshot()
+    assert held == [packets[30]] * 11 and of_frames == [metadata[30]] * 11
+    assert ring.n_bytes == 11 * len(packets[30].data) and ring.newest_us == packets[30].abs_us
+
+
+def test_pictures_that_come_late_and_all_at_once_are_kept_for_the_whole_span() -> None:
+    now = [at(60)]  # the unit stood still for longer than the span
+    ring = FrameRing(10 * PERIOD_NS, clock=lambda: now[0])
+    packets, _ = stream(50)
+    for packet in packets:
+        ring.on_packet(packet)
+    assert ring.snapshot()[0] == packets[-11:]
+
+
 def test_snapshots_are_whole_while_the_camera_appends() -> None:
     ring = FrameRing(20 * PERIOD_NS)
     packets, metadata = stream(4000)
