@@ -276,8 +276,8 @@ def check_config(config: DeviceConfig, *, where: str) -> None:
     period_us = _US_PER_S / config.camera.frame_rate_hz
     if config.camera.exposure_us >= period_us:
         raise ConfigError(
-            f"{where}: camera.exposure_us: {config.camera.exposure_us} us does not fit the frame period "
-            f"of {period_us:.0f} us at {config.camera.frame_rate_hz:g} Hz"
+            f"{where}: camera.exposure_us: {config.camera.exposure_us} µs does not fit the frame period "
+            f"of {period_us:.0f} µs at {config.camera.frame_rate_hz:g} Hz"
         )
 
 

@@ -138,12 +138,12 @@ class ControlsCheck:
         line_us = self._line_time_us
         wrong = []
         if not s.exposure_us - line_us - 1 <= r.exposure_us <= s.exposure_us + 1:
-            wrong.append(f"exposure is {r.exposure_us} us, wanted {s.exposure_us} us")
+            wrong.append(f"exposure is {r.exposure_us} µs, wanted {s.exposure_us} µs")
         gain_slack = s.analogue_gain * (0.01 + _GAIN_STEP_AT_1 * s.analogue_gain)
         if abs(r.analogue_gain - s.analogue_gain) > gain_slack:
             wrong.append(f"analogue gain is {r.analogue_gain:.4g}, wanted {s.analogue_gain:.4g}")
         if not s.frame_duration_us - line_us - 1 <= r.frame_duration_us <= s.frame_duration_us + 1:
-            wrong.append(f"frame period is {r.frame_duration_us} us, wanted {s.frame_duration_us} us")
+            wrong.append(f"frame period is {r.frame_duration_us} µs, wanted {s.frame_duration_us} µs")
         if r.colour_gains is not None and any(
             abs(have - want) > 0.01 * want for have, want in zip(r.colour_gains, s.colour_gains, strict=True)
         ):
@@ -191,7 +191,7 @@ def check_frame_rate(reports: Sequence[FrameReport], *, tolerance: float) -> Non
     found_us, said_us = median(gaps_us), reports[-1].frame_duration_us
     if abs(found_us - said_us) > tolerance * said_us:
         raise HardwareError(
-            f"camera: frames come every {found_us:.0f} us, but their metadata say {said_us} us. This "
+            f"camera: frames come every {found_us:.0f} µs, but their metadata say {said_us} µs. This "
             "computer does not keep up: lower camera.frame_rate_hz or camera.bitrate_bps, and stop other "
             "programs"
         )

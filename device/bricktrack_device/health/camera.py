@@ -63,7 +63,7 @@ def _judge_stream(
     for frame in metadata:
         if abs(frame.exposure_us - section.exposure_us) > _EXPOSURE_TOLERANCE_US:
             raise HardwareError(
-                f"exposure wanders: {frame.exposure_us} us; expected {section.exposure_us} us"
+                f"exposure wanders: {frame.exposure_us} µs; expected {section.exposure_us} µs"
             )
         if abs(frame.analogue_gain - section.analogue_gain) > _GAIN_TOLERANCE * section.analogue_gain:
             raise HardwareError(f"gain wanders: {frame.analogue_gain:g}; expected {section.analogue_gain:g}")
@@ -71,12 +71,12 @@ def _judge_stream(
     period_us = median(gaps) if gaps else 0.0
     if abs(period_us - section.frame_duration_us) > _PERIOD_TOLERANCE * section.frame_duration_us:
         raise HardwareError(
-            f"{section.model}: a picture every {period_us:.0f} us; expected {section.frame_duration_us} us"
+            f"{section.model}: a picture every {period_us:.0f} µs; expected {section.frame_duration_us} µs"
         )
     n_missing = sum(round(gap / period_us) - 1 for gap in gaps if gap > 1.5 * period_us)
     words = (
         f"{section.model}: {len(stamps_us)} pictures in {stream_s:g} s, {1e6 / period_us:.4f} Hz, "
-        f"{n_missing} dropped, exposure {section.exposure_us} us and gain {section.analogue_gain:g} held, "
+        f"{n_missing} dropped, exposure {section.exposure_us} µs and gain {section.analogue_gain:g} held, "
         f"{section.encoder}"
     )
     if n_missing:
@@ -91,7 +91,7 @@ def _judge_mode(section: CameraSection) -> CheckResult:
     read_out_ms = float(m.row_delay_ns(m.height - 1)) / 1e6
     words = (
         f"{m.name}: {m.width}x{m.height} px from {m.crop_width}x{m.crop_height} at ({m.crop_x}, {m.crop_y}) "
-        f"of the sensor, binned by {m.binning}, {m.line_time_ns / 1000:.4f} us a line, {read_out_ms:.2f} ms "
+        f"of the sensor, binned by {m.binning}, {m.line_time_ns / 1000:.4f} µs a line, {read_out_ms:.2f} ms "
         "from the first row to the last"
     )
     period_ms = section.frame_duration_us / 1000

@@ -45,7 +45,7 @@ def check_clocks() -> list[CheckResult]:
     triplet = read_clock_triplet()
     check_monotonic_is_boottime(triplet)
     difference_us = (triplet.boottime_ns - triplet.monotonic_ns) / 1000
-    return [good("clocks", f"BOOTTIME - MONOTONIC = {difference_us:.1f} us")]
+    return [good("clocks", f"BOOTTIME - MONOTONIC = {difference_us:.1f} µs")]
 
 
 def processor_temperature_degc(path: Path = THERMAL) -> float | None:

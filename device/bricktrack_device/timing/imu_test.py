@@ -181,7 +181,7 @@ def print_report(result: Result, console: Console | None = None) -> None:
     grid = result.figures["grid"]
     console.print("\nlateness of the sampler's reads after their slots:", highlight=False)
     top = max(2 * grid["lateness_us_p99"], 1.0)
-    for line in text_histogram(result.values["grid_lateness_us"], unit="us", limits=(0.0, top)):
+    for line in text_histogram(result.values["grid_lateness_us"], unit="µs", limits=(0.0, top)):
         console.print(line, markup=False, highlight=False)
 
 
@@ -212,11 +212,11 @@ def _table(result: Result) -> Table:
     row("  its standard error", "drift_ppm_standard_error", ".2f")
     row("fell behind by, ms", "accumulated_drift_ms", ".2f")
     for q in PERCENTILES:
-        row(f"lateness p{q:g}, us", f"lateness_us_p{q:g}", ".0f")
+        row(f"lateness p{q:g}, µs", f"lateness_us_p{q:g}", ".0f")
     for q in PERCENTILES:
-        row(f"|interval - period| p{q:g}, us", f"interval_error_us_p{q:g}", ".0f", compare=True)
+        row(f"|interval - period| p{q:g}, µs", f"interval_error_us_p{q:g}", ".0f", compare=True)
     for q in (50, 99, 100):
-        row(f"bus time p{q:g}, us", f"bus_time_us_p{q:g}", ".0f")
+        row(f"bus time p{q:g}, µs", f"bus_time_us_p{q:g}", ".0f")
     return table
 
 

@@ -116,8 +116,8 @@ def _has_arrived(ring: FrameRing, stamp_ns: int, section: CameraSection) -> bool
 def _check_mode(section: CameraSection) -> None:
     if section.exposure_us > 0.5 * section.frame_duration_us:
         raise HardwareError(
-            f"an exposure of {section.exposure_us} us is too long for this test: more than half of the frame "
-            f"period, {section.frame_duration_us} us. Lower camera.exposure_us"
+            f"an exposure of {section.exposure_us} µs is too long for this test: more than half of the frame "
+            f"period, {section.frame_duration_us} µs. Lower camera.exposure_us"
         )
 
 
@@ -348,26 +348,26 @@ def print_report(result: Result, console: Console | None = None) -> None:
     say(
         f"{f['switchings_found']} of {f['switchings']} switchings found ({f['switchings_wanted']} asked "
         f"for), in {f['rows']} rows of {s['leds_seen']} LEDs; {f['frames_dropped']} frames dropped; "
-        f"exposure {s['exposure_us']} us"
+        f"exposure {s['exposure_us']} µs"
     )
     say(
-        f"camera less GPIO: mean {f['mean_us']:+.1f} us, sd {f['sd_us']:.1f} us a switching, worst "
-        f"{f['worst_us']:.1f} us; sd {f['row_sd_us']:.1f} us a row"
+        f"camera less GPIO: mean {f['mean_us']:+.1f} µs, sd {f['sd_us']:.1f} µs a switching, worst "
+        f"{f['worst_us']:.1f} µs; sd {f['row_sd_us']:.1f} µs a row"
     )
     say(
-        f"on {f['mean_on_us']:+.1f} us, off {f['mean_off_us']:+.1f} us: half their difference is the error "
+        f"on {f['mean_on_us']:+.1f} µs, off {f['mean_off_us']:+.1f} µs: half their difference is the error "
         "of the assumed response curve, not of time"
     )
     say(
-        f"drift {f['drift_us_per_s']:+.2f} ± {f['drift_us_per_s_standard_error']:.2f} us/s; along the "
-        f"read-out {f['read_out_us_per_ms']:+.2f} ± {f['read_out_us_per_ms_standard_error']:.2f} us a ms "
+        f"drift {f['drift_us_per_s']:+.2f} ± {f['drift_us_per_s_standard_error']:.2f} µs/s; along the "
+        f"read-out {f['read_out_us_per_ms']:+.2f} ± {f['read_out_us_per_ms_standard_error']:.2f} µs a ms "
         "(a wrong line time shows here)"
     )
-    say(f"writing the pin took {f['gpio_write_us']:.0f} us: the instants are known no better")
+    say(f"writing the pin took {f['gpio_write_us']:.0f} µs: the instants are known no better")
     say("\nerror of each switching:")
-    for line in text_histogram(result.values["switch_error_us"], unit="us", n_bins=12):
+    for line in text_histogram(result.values["switch_error_us"], unit="µs", n_bins=12):
         say(line)
-    say("\nerror by row, us:")
+    say("\nerror by row, µs:")
     for line in row_table(result):
         say(line)
 

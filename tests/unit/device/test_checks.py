@@ -85,7 +85,7 @@ def test_a_camera_whose_exposure_wanders_fails(tmp_path: Path) -> None:
             return section
 
     result = check(tmp_path, FakeRig(camera=Wandering()))["camera"]
-    assert not result.ok and "exposure wanders: 2500 us; expected 2000 us" in result.detail
+    assert not result.ok and "exposure wanders: 2500 µs; expected 2000 µs" in result.detail
 
 
 def test_a_camera_at_another_rate_than_it_says_fails(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_a_camera_at_another_rate_than_it_says_fails(tmp_path: Path) -> None:
             return section
 
     result = check(tmp_path, FakeRig(camera=Slow()))["camera"]
-    assert not result.ok and "expected 33327 us" in result.detail
+    assert not result.ok and "expected 33327 µs" in result.detail
 
 
 def test_a_sensor_that_failed_its_self_test_is_named(tmp_path: Path) -> None:

@@ -52,10 +52,10 @@ def test_frames_that_hold_the_controls_are_steady_after_enough_of_them() -> None
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"ExposureTime": 1964}, "exposure is 1964 us, wanted 2000 us"),  # one line less than it must be
-        ({"ExposureTime": 2004}, "exposure is 2004 us, wanted 2000 us"),
+        ({"ExposureTime": 1964}, "exposure is 1964 µs, wanted 2000 µs"),  # one line less than it must be
+        ({"ExposureTime": 2004}, "exposure is 2004 µs, wanted 2000 µs"),
         ({"AnalogueGain": 1.1}, "analogue gain is 1.1, wanted 1"),
-        ({"FrameDuration": 40000}, "frame period is 40000 us, wanted 33333 us"),
+        ({"FrameDuration": 40000}, "frame period is 40000 µs, wanted 33333 µs"),
         ({"ColourGains": (1.5, 2.0)}, r"colour gains are \(1.5, 2.0\), wanted \(1.5, 1.5\)"),
     ],
 )
@@ -118,7 +118,7 @@ def frames_every(period_ns: int, n: int = 16) -> list[FrameReport]:
 
 def test_frames_must_come_as_often_as_they_say() -> None:
     check_frame_rate(frames_every(33_326_870), tolerance=0.01)
-    with pytest.raises(HardwareError, match="frames come every 40000 us, but their metadata say 33326 us"):
+    with pytest.raises(HardwareError, match="frames come every 40000 µs, but their metadata say 33326 µs"):
         check_frame_rate(frames_every(40_000_000), tolerance=0.01)
 
 
