@@ -4,6 +4,13 @@ The brick rests where it stood when the short recording begins and when it ends,
 without a jump: its film is copied behind itself, whole groups of pictures long. The inertial samples and the
 square wave are simulated anew over the whole length, on clocks that run through: only the noise of the
 pictures comes again.
+
+So such a recording tells what processing it takes in time and memory, and not how well it is measured. Noise
+that comes again never averages out, though it is believed to: over ten minutes and more the fused motion errs by
+far more than its sd, and lies beside the motion pose by pose, by which `process` warns. In a simulated run of 600 s
+and seven LEDs, whose motion comes again every 15 s, squared errors over their covariance by their degrees of
+freedom (NEES/6) were 19 on the median where the centroids' noise came again too, all instants beyond their 95 %
+region; and 0.8, 99 % within it, where the noise was new each time and all else the same.
 """
 
 import shutil
