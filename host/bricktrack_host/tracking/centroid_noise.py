@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors
+from bricktrack_host.tracking.frame_errors import MIN_LEDS, FrameErrors, floor_px2
 from bricktrack_host.tracking.pictures.light_kernel import FLOOR_SD_PX
 from bricktrack_host.tracking.pose.finite import all_finite
 from bricktrack_host.tracks import LedObservations
@@ -79,8 +79,8 @@ def with_measured_noise(
     if is_keyframe is not None:
         kinds = _picture_kinds(is_keyframe)
         variance = _variance_of_kinds(errors, kinds, noise)[kinds]
-    more = (variance - FLOOR_SD_PX**2)[:, None, None, None] * np.eye(2)
-    return replace(observations, cov_px2=observations.cov_px2 + more)
+    more = variance[:, None] - floor_px2(observations.cov_px2)
+    return replace(observations, cov_px2=observations.cov_px2 + more[..., None, None] * np.eye(2))
 
 
 def _picture_kinds(is_keyframe: BoolArray) -> IntArray:

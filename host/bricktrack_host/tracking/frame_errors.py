@@ -64,6 +64,14 @@ class FrameErrors:
         return error.reshape(len(rows), m), J.reshape(len(rows), m, 6), D
 
 
+def floor_px2(cov_px2: FloatArray) -> FloatArray:
+    """Return what of stated covariances of centroids, (..., 2, 2), is the segmentation's floor, (...); px^2.
+
+    Centroids from elsewhere may be stated better than it: then nothing is left beside it.
+    """
+    return np.asarray(np.minimum(FLOOR_SD_PX**2, np.linalg.eigvalsh(cov_px2)[..., 0]))
+
+
 def frame_errors(
     observations: LedObservations,
     first: FirstPoses,
@@ -102,10 +110,8 @@ def frame_errors(
             twist_dt = motion.dt_s[frames][..., None] * motion.twist_sd[frames][:, None]
     prediction, J = predict_brick(R_led, t_led, ray_model, brick_model, collar_mm=collar_of(brick_model))
     shift = prediction.model_shift_px
-    # Centroids from elsewhere may be stated better than the floor: then nothing is left beside it.
     stated = observations.cov_px2[frames]
-    floor_px2 = np.minimum(FLOOR_SD_PX**2, np.linalg.eigvalsh(stated)[..., 0])
-    pixels = stated - floor_px2[..., None, None] * np.eye(2)
+    pixels = stated - floor_px2(stated)[..., None, None] * np.eye(2)
     return FrameErrors(
         frames=frames,
         seen=seen,

@@ -124,6 +124,35 @@ def test_where_no_picture_is_coded_for_itself_all_have_one_noise():
     )
 
 
+def test_centroids_stated_better_than_the_floor_are_as_noisy_as_their_residuals():
+    n, sd_px = 60, 0.005
+    R, t = random_poses(n, seed=16)
+    observations = seen(R, t, np.random.default_rng(17).normal(0, sd_px, (n, 7, 2)))
+    observations.cov_px2[:] = 0.003**2 * np.eye(2)
+    observations.uv_px[5, 2] = observations.cov_px2[5, 2] = np.nan
+    first = start_poses(observations, CAMERA, BRICK)
+    errors = frame_errors(observations, first, CAMERA, BRICK, rolling_shutter=False)
+    told = with_measured_noise(observations, errors, np.arange(n) % 15 == 0)
+    # The floor counts as one residual beside 480, which tell the sd to 3 %, the grid to 5 %.
+    expected_px = np.sqrt(sd_px**2 + FLOOR_SD_PX**2 / 480)
+    np.testing.assert_allclose(np.sqrt(np.nanmedian(told.cov_px2[..., 0, 0])), expected_px, rtol=0.2)
+    assert np.nanmin(np.linalg.eigvalsh(told.cov_px2)) > 0
+    track = solve_poses(told, CAMERA, BRICK, rolling_shutter=False, first=first)
+    assert np.isfinite(track.R_camera_brick).all()
+
+
+def test_where_every_picture_is_coded_for_itself_all_have_one_noise():
+    R, t = random_poses(40, seed=14)
+    observations = seen(R, t, np.random.default_rng(15).normal(0, 0.02, (40, 7, 2)))
+    first = start_poses(observations, CAMERA, BRICK)
+    errors = frame_errors(observations, first, CAMERA, BRICK, rolling_shutter=False)
+    every = np.ones(40, dtype=bool)
+    np.testing.assert_allclose(
+        with_measured_noise(observations, errors, every).cov_px2,
+        with_measured_noise(observations, errors).cov_px2,
+    )
+
+
 def test_the_share_that_stands_still_is_told_from_residuals():
     rng = np.random.default_rng(8)
     shares = [
