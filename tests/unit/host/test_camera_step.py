@@ -83,3 +83,19 @@ def test_a_step_is_sought_in_stretches_as_in_the_whole_run(monkeypatch):
     assert step.rvec_rad == pytest.approx(whole.rvec_rad, rel=1e-6)
     assert step.covariance == pytest.approx(whole.covariance, rel=1e-6, abs=1e-12)
     assert step.gain == pytest.approx(whole.gain, rel=1e-6)
+
+
+def test_a_sample_that_was_not_read_is_no_knock():
+    shake = simulate_shake(
+        3, duration_s=4.0, rotation_deg=0.3, rotation_sd_deg=0.01, periodic_hz=22.0, lowpass_hz=200.0
+    )
+    imu, alignment = shake.imu, align_times(shake.optical, shake.imu)
+    kept = np.arange(len(imu.t_ns)) != 199  # the cubic across is 0.3 degrees off
+    imu = replace(
+        imu,
+        t_ns=imu.t_ns[kept],
+        gyro_radps=imu.gyro_radps[kept],
+        acc_mps2=imu.acc_mps2[kept],
+        flags=imu.flags[kept],
+    )
+    assert words_on_camera_step(shake.optical, imu, alignment) == []

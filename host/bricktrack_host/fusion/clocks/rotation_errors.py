@@ -35,7 +35,8 @@ class AttitudeStep:
         In the axes that attitudes are compared in.
     covariance : ndarray, shape (3, 3), rad^2
     gain : float
-        By so much chi-square (3 degrees of freedom) is less with it.
+        By so much chi-square (3 degrees of freedom) is less with it; less than that where samples that were
+        not read may have made it.
     """
 
     frame: int
@@ -57,7 +58,10 @@ class _Fitted:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LinearFit:
-    """Errors of attitudes, (n, 3), as a sum of columns, (n, 3, c), of prior sd (c,), beside a slow drift."""
+    """Errors of attitudes, (n, 3), as a sum of columns, (n, 3, c), of prior sd (c,), beside a slow drift.
+
+    ``turn_sd_rad``, (n,): how unsure it is what the gyro turned since the frame before, beside its drift.
+    """
 
     inside: BoolArray
     columns: FloatArray
@@ -65,6 +69,7 @@ class _LinearFit:
     error: FloatArray
     inverse_sd: FloatArray
     hats: tuple[IntArray, FloatArray, int]
+    turn_sd_rad: FloatArray
 
     def drift(self, weight: FloatArray, values: FloatArray) -> FloatArray:
         """Return the slow drift in values, (n, c)."""
@@ -92,7 +97,35 @@ class _LinearFit:
             # The median of sqrt(chi-square of 3 / 3) is 0.888.
             scale = max(float(np.median(left * self.inverse_sd)) / 0.888, 1e-6)
             weight = self.inverse_sd * (1 + (left * self.inverse_sd / (2.5 * scale)) ** 2) ** -0.25
-        return _Fitted(np.asarray(found), np.asarray(np.linalg.inv(information)), weight, scale, white)
+        covariance = np.asarray(np.linalg.inv(information))
+        return _Fitted(np.asarray(found), covariance, weight, scale, white)
+
+    def unfelt(self, rows: slice) -> IntArray:
+        """Return the frames among some rows before which the gyro's turn is unsure; not the first row."""
+        return np.asarray(rows.start + 1 + np.flatnonzero(self.turn_sd_rad[rows][1:]))
+
+    def steps(
+        self, fitted: _Fitted, frames: IntArray, rows: slice, hats: tuple[IntArray, FloatArray, int]
+    ) -> FloatArray:
+        """Return steps at frames, less their drift and over the rows' sd, shape (n_rows, n_steps)."""
+        since = np.greater_equal.outer(np.arange(rows.start, rows.stop), frames).astype(np.float64)
+        weight = fitted.weight[rows] / fitted.scale
+        return np.asarray((since - drift_of(fitted.weight[rows], *hats, since)) * weight[:, None])
+
+    def covariance_by_turns(self, fitted: _Fitted) -> FloatArray:
+        """Return what turns that the gyro did not feel add to the covariance of what was found."""
+        frames = self.unfelt(slice(0, len(self.error)))
+        weight = fitted.weight / fitted.scale
+        pulls = np.zeros((0, self.columns.shape[2]))
+        for first in range(0, len(frames), _STEPS_AT_ONCE):
+            some = frames[first : first + _STEPS_AT_ONCE]
+            rows, near = self.near(some)
+            A = fitted.white[rows, :, :-1] * weight[rows, None, None]
+            pull = np.einsum("nk,nip->kip", self.steps(fitted, some, rows, near), A, optimize=True)
+            pull *= self.turn_sd_rad[some][:, None, None]
+            pulls = np.concatenate([pulls, pull.reshape(-1, pulls.shape[1])])
+        off = pulls @ fitted.covariance
+        return np.asarray(off.T @ off)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,6 +144,8 @@ class _AgainstGyro:
     inverse_sd : ndarray, shape (n,)
     hats
         Of the drift, see `hats`.
+    turn_sd_rad : ndarray, shape (n,)
+        How unsure it is, by samples that were not read, what the gyro turned since the frame before.
     """
 
     inside: BoolArray
@@ -119,6 +154,7 @@ class _AgainstGyro:
     by_gyro: FloatArray
     inverse_sd: FloatArray
     hats: tuple[IntArray, FloatArray, int]
+    turn_sd_rad: FloatArray
 
 
 class RotationErrors:
@@ -160,7 +196,8 @@ class RotationErrors:
         if linear is None:
             return None
         n, fit = basis.shape[1], linear.fit()
-        return fit.found[:n], fit.covariance[:n, :n]
+        covariance = fit.covariance + linear.covariance_by_turns(fit)
+        return fit.found[:n], covariance[:n, :n]
 
     def attitude_step(self) -> AttitudeStep | None:
         """Return the step of the attitudes against the gyro that explains most; None as in `time_errors`.
@@ -178,18 +215,27 @@ class RotationErrors:
         for first in range(_BESIDE_STEP, stop, _STEPS_AT_ONCE):
             steps = np.arange(first, min(first + _STEPS_AT_ONCE, stop))
             rows, hats = linear.near(steps)
-            since = np.greater_equal.outer(np.arange(n)[rows], steps).astype(np.float64)
-            white = (since - drift_of(fit.weight[rows], *hats, since)) * weight[rows, None]
+            white = linear.steps(fit, steps, rows, hats)
             beside = np.einsum("nk,nip->kip", white, A[rows], optimize=True)
             # The least is for steps that the drift takes up, as it does between stretches with samples.
             normal = (np.einsum("nk,nk->k", white, white)[:, None, None] + 1e-9) * np.eye(3)
             normal -= beside @ fit.covariance @ np.swapaxes(beside, 1, 2)
             pull = white.T @ left[rows]
             size = np.linalg.solve(normal, pull[..., None])[..., 0]
-            gain = np.einsum("ki,ki->k", pull, size)
+            # What the gyro did not feel pulls at steps nearby, too.
+            unfelt = linear.unfelt(rows)
+            others = linear.steps(fit, unfelt, rows, hats) * linear.turn_sd_rad[unfelt]
+            beside_others = np.einsum("nk,nip->kip", others, A[rows], optimize=True)
+            by_others = (white.T @ others)[:, :, None, None] * np.eye(3) - np.einsum(
+                "kip,pq,gjq->kgij", beside, fit.covariance, beside_others, optimize=True
+            )
+            pull_covariance = normal + np.einsum("kgij,kglj->kil", by_others, by_others, optimize=True)
+            gain = np.einsum("ki,ki->k", pull, np.linalg.solve(pull_covariance, pull[..., None])[..., 0])
             best = int(np.argmax(gain))
             frame = int(np.flatnonzero(linear.inside)[steps[best]])
-            found.append(AttitudeStep(frame, size[best], np.linalg.inv(normal[best]), float(gain[best])))
+            inverse = np.linalg.inv(normal[best])
+            covariance = inverse @ pull_covariance[best] @ inverse
+            found.append(AttitudeStep(frame, size[best], covariance, float(gain[best])))
         return max(found, key=lambda step: step.gain)
 
     @cached_property
@@ -213,6 +259,7 @@ class RotationErrors:
             by_gyro=np.concatenate([design[:, :, 2:], by_axes], axis=2),
             inverse_sd=1 / self.frames.sd_rad[inside],
             hats=hats(t, segment[inside]),
+            turn_sd_rad=_turn_sd(self._signal, t),
         )
 
     def _linear(self, basis: FloatArray, prior_sd_s: FloatArray) -> _LinearFit | None:
@@ -230,4 +277,21 @@ class RotationErrors:
             error=known.error,
             inverse_sd=known.inverse_sd,
             hats=known.hats,
+            turn_sd_rad=known.turn_sd_rad,
         )
+
+
+def _turn_sd(signal: ImuSignal, t_s: FloatArray) -> FloatArray:
+    """Return how unsure it is, by samples not read, what the gyro turned since the instant before, rad.
+
+    That is the error of the cubic across an interval, in which it is of one sign, times its length. Instants
+    rise, shape (n,), as what is returned is; that is zero where all samples were read.
+    """
+    variance = np.zeros(len(t_s))
+    start = np.searchsorted(signal.t_s, signal.gaps_s[:, 0])
+    bridge = np.maximum(signal.gyro_bridge_radps[start], signal.gyro_bridge_radps[start + 1])
+    after = np.searchsorted(t_s, signal.gaps_s.mean(axis=1))
+    inside = (after > 0) & (after < len(t_s))
+    turn = bridge * np.diff(signal.gaps_s, axis=1)[:, 0]
+    np.add.at(variance, after[inside], turn[inside] ** 2)
+    return np.sqrt(variance)
