@@ -14,7 +14,11 @@ _SETTLED_S = 1e-6  # a twentieth of the sharpest sd
 _MISFIT_CAP = 25.0
 LOSS_PRIOR_SD_S2 = 2e-5  # of c: 4.5 ms squared, the BNO055's narrower settings
 DISPERSION_PRIOR_SD_S3 = 5e-8
-"""Of d: a second-order low-pass of 7 ms mean delay has 3e-8 (critically damped) to -6e-8 (Butterworth)."""
+"""Of d: a second-order low-pass of 7 ms mean delay has 3e-8 (critically damped) to -6e-8 (Butterworth).
+
+A BNO055 read by the daemon has that: 32 Hz, set where the mode leaves it open, the chip's own in its fusion
+modes. Imported samples of a gyro below 20 Hz have more, and their offset is less sure than said.
+"""
 _NEXT_TERM_SHARE = 0.25
 """How unsure terms left out make what d does to the offset: 2 pi f times 3.5 ms, squared, at 23 Hz."""
 
