@@ -204,3 +204,31 @@ def test_an_led_that_is_off_all_the_time_is_found():
     assert offset[4, 0] > 0.12
     assert done.errors.offset_sd_px > 0.03
     assert sd[4, 0] < 0.2
+
+
+@pytest.mark.parametrize(("beside_px", "is_used"), [(0.3, True), (3.0, False)])
+def test_an_led_a_little_beside_its_place_is_left_out_of_no_pass(beside_px, is_used, monkeypatch):
+    # Else it is in and out by turns, and each pass believes what the one before did not.
+    used = []
+    learn = LedSmoother._learn
+
+    def keep(self, done, errors):
+        learn(self, done, errors)
+        used.append(self._use[self._sights.leds.led == 4].mean())
+
+    monkeypatch.setattr(LedSmoother, "_learn", keep)
+    run = simulate_run(32, duration_s=4.0)
+    uv = run.observations.uv_px.copy()
+    uv[:, 4, 0] += beside_px
+    smoothed(replace(run, observations=replace(run.observations, uv_px=uv)))
+    assert min(used) > 0.99 if is_used else used[0] < 0.5
+
+
+def test_three_sharp_leds_at_the_start_leave_no_variance_to_rounding():
+    # Where the start was as wide as bricks move, variances were negative and the filter went astray for frames.
+    run = simulate_run(31, duration_s=3.0, centroid_sd_px=0.002)
+    uv = run.observations.uv_px.copy()
+    uv[:7, :4] = np.nan
+    done = smoothed(replace(run, observations=replace(run.observations, uv_px=uv)))
+    assert np.all(done.states.estimate.variance[:, 0] > 0)
+    assert done.states.problem.leds.inflation.max() < 5

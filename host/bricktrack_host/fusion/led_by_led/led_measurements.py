@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.brick_model import BrickModel
@@ -305,16 +306,16 @@ def led_arrays(
     return arrays, noise
 
 
-def led_chi2(problem: Problem, estimate: Estimate) -> FloatArray:
+def led_chi2(problem: Problem, estimate: Estimate, *, beside_px: ArrayLike = 0.0) -> FloatArray:
     """Return how far each LED lies from what all the others say, over its covariance (2 degrees of freedom).
 
-    See `noise_choice.frame_chi2`; of one run that is a batch alone. NaN where rounding leaves no covariance
-    to judge by.
+    Or from ``beside_px`` next to it, shape (m, 2). See `noise_choice.frame_chi2`; of one run that is a batch
+    alone. NaN where rounding leaves no covariance to judge by.
     """
     leds = problem.leds
     if leds is None:
         raise ValueError("the problem has no LEDs")
-    y, A = estimate.led_residual_px, estimate.led_cov_px2
+    y, A = estimate.led_residual_px - np.asarray(beside_px, dtype=np.float64), estimate.led_cov_px2
     given = leds.cov_px2 * leds.inflation[:, None, None]
     rest = _inverse(1.02 * given - A)
     S = leds.cov_px2 + np.where(leds.use[:, None, None], A + A @ rest @ A, A)

@@ -35,7 +35,7 @@ from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run, build
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts
 from bricktrack_host.fusion.pose_by_pose.pose_level import Smoothed, relinearised
 from bricktrack_host.fusion.smoothing.linearisation import Linearisation
-from bricktrack_host.fusion.smoothing.smoother import POS, SEEN, Filter, Problem
+from bricktrack_host.fusion.smoothing.smoother import POS, SEEN, VEL, Filter, Problem
 from bricktrack_host.fusion.smoothing.standing_doubt import Doubt
 
 _MOST_PASSES = 5
@@ -47,8 +47,13 @@ _PICTURES_HOLD_PX = 0.2
 """Within which a picture moves in proportion to the motion, of focal lengths about 1500 px: the square leaves
 0.0001 px, and of the few that move by a pixel, at impacts, 0.003 px."""
 _HELD_SHARE = 0.99
+_START = VEL.stop  # attitude, position and velocity come first
+_START_SHARE = 0.1
+"""Of how unsure the start is without a pass before: still 50 times what passes move it by. Single LEDs of
+0.005 px tell it: of a start that is as wide as bricks move, rounding left a wrong or negative variance."""
 _NONE = SEEN[:0]
 _GATE_CHI2 = 20.7  # of 2 degrees of freedom; passed by all but one in 30 000
+_MOST_BESIDE_PX = 1.0  # an LED that stands farther beside its place is another light
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +208,11 @@ class LedSmoother:
         belief, still = self._belief, self._sights.still
         scales = centroid_scales(done.chi2, still, done.use, belief.scales)
         more = (scales / belief.scales)[still.astype(np.int64)]
-        self._use = (done.chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
+        # An LED that stands beside its place is no outlier in any frame: by how much is estimated.
+        estimate = done.states.estimate
+        beside_px = _stands_beside_px(estimate.led_residual_px, self._sights.leds.led, self._n_leds)
+        chi2 = np.fmin(done.chi2, led_chi2(done.states.problem, estimate, beside_px=beside_px))
+        self._use = (chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
         run = belief.run.with_sensor(errors.of_sensor(since=belief.errors))
         self._belief = replace(belief, run=run, scales=scales, errors=errors)
         if not done.holds():
@@ -260,6 +269,18 @@ class LedSmoother:
         return _Pass(ready.pictured, ready.use, states, led_chi2(ready.problem, estimate))
 
 
+def _stands_beside_px(residual_px: FloatArray, led: IntArray, n_leds: int) -> FloatArray:
+    """Return how far each LED lies beside its place on the median over the run, at each of its m sightings.
+
+    Shape (m, 2); zero where that is farther than LEDs stand.
+    """
+    of_leds = np.zeros((n_leds, 2))
+    for i in np.unique(led):
+        of_leds[i] = np.median(residual_px[led == i], axis=0)
+    of_leds[~(np.hypot(*of_leds.T) < _MOST_BESIDE_PX)] = 0.0
+    return of_leds[led]
+
+
 def _moved_sds(before_m: FloatArray, now: Smoothed) -> float:
     """Return by how much a pass has moved the brick from where it was at the nodes on the mean, in sd."""
     n = min(len(before_m), len(now.nodes.t_s))
@@ -287,11 +308,14 @@ def _prepared(
         [run], [nodes], [lin], settings=settings, use_frame=[np.zeros(0, dtype=np.bool_)],
         noise_scale=[np.ones(2)], levels=[belief.levels],
     )  # fmt: skip
+    P_start = problem.P_start.copy()
+    P_start[:, :_START, :_START] *= _START_SHARE**2
     arrays, of_leds = led_arrays(
         leds, pictured, run, nodes, lin, belief.levels,
         cov_px2=believed_covariance_px2(leds, sights.still, belief.scales), use=use, settings=settings,
     )  # fmt: skip
-    return _Ready(pictured, use, run, nodes, lin, replace(problem, leds=arrays)), of_steps, of_leds
+    problem = replace(problem, leds=arrays, P_start=P_start)
+    return _Ready(pictured, use, run, nodes, lin, problem), of_steps, of_leds
 
 
 def _placeable(leds: SeenLeds, s: Smoothed, settings: FusionSettings) -> SeenLeds:
