@@ -23,6 +23,7 @@ N_DATA_BYTES = LAST_REGISTER - FIRST_REGISTER + 1
 STANDARD_GRAVITY_MPS2 = 9.80665
 _MAX_ACC_STEP_MPS2 = 300.0  # between samples 10 ms apart; 30 g is the worst impact expected on a table
 _MAX_GYRO_STEP_RADPS = 40.0
+_LONGEST_READ_NS = 10_000_000  # a burst at 100 kHz takes 5 ms, and the chip stretches the clock
 
 IMU_SCHEMA = StreamSchema(
     "bricktrack.imu",
@@ -44,7 +45,7 @@ class ImuFlag(IntFlag):
     NONE = 0
     GAP = 1
     """No data: the read failed, the slot was skipped because the one before ran over, or the read took longer
-    than a slot, as on a bus that hung and came free: nobody knows when the chip was asked."""
+    than a slot and than 10 ms, as on a bus that hung and came free: nobody knows when the chip was asked."""
     LATE = 2
     """The read began more than 2 ms after its slot; the stamp is right, the spacing is not."""
     REPEAT = 4
@@ -206,12 +207,13 @@ def decode_imu(description: ImuDescription, records: list[ImuRecord]) -> ImuSamp
     flags = np.full(n, int(ImuFlag.GAP), dtype=np.int64)
     mode_wrong = np.zeros(n, dtype=np.bool_)
     wrong, since = False, 0
+    longest_ns = max(description.period_ns, _LONGEST_READ_NS)
     for record in records:
         i = record.slot - first
         if record.status is not None and len(record.status) == 3:
             mode_wrong[since:i] = wrong
             wrong, since = record.status[2] != description.opr_mode, i
-        if record.data is not None and record.t_after_ns - record.t_before_ns <= description.period_ns:
+        if record.data is not None and record.t_after_ns - record.t_before_ns <= longest_ns:
             raw[i] = np.frombuffer(record.data, dtype=np.uint8)
             t_ns[i] = (record.t_before_ns + record.t_after_ns) // 2 + description.latency_ns
             late = record.t_before_ns - t_due[i] > 2_000_000

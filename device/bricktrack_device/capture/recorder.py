@@ -167,7 +167,7 @@ class Recorder:
     def _obey(self, command: Command) -> None:
         try:
             if isinstance(command, ArmCommand):
-                session = self._arm(command.order)
+                session = self._arm(self._order.supersede(command.order))
                 self._order.note(command.order)
                 self._auto_arm = self._config.recording.auto_arm
                 command.answer(Armed(run_id=session.run_id, missing=[m[:2000] for m in session.missing]))

@@ -63,6 +63,11 @@ class StandingOrder:
         except OSError as e:
             logger.warning("%s: a daemon that is killed will not arm again: %s", self._path, e.strerror or e)
 
+    def supersede(self, order: ArmOrder) -> ArmOrder:
+        """Take back what a killed daemon left, for a newer order, whether or not that can be carried out."""
+        self.left = None
+        return order
+
     def forget(self) -> None:
         """Keep none: it is carried out, or taken back."""
         self.left = None

@@ -1,6 +1,7 @@
 import dataclasses
 import struct
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -60,6 +61,14 @@ def test_a_read_that_outlasts_its_slot_is_a_gap_for_nobody_knows_when_it_was_mea
     assert (np.diff(s.t_ns) > 0).all()
     just_in_time = dataclasses.replace(hung, t_after_ns=hung.t_before_ns + AMG.period_ns)
     assert decode([just_in_time]).flags.tolist() == [0]
+
+
+def test_reads_that_take_longer_than_a_short_slot_are_samples_of_every_second_slot():
+    fast = msgspec.structs.replace(AMG, period_ns=4_000_000)
+    starts = [fast.t0_ns + slot * fast.period_ns for slot in (0, 2, 4)]
+    s = decode([ImuRecord(2 * i, t, t + 6_000_000, burst(i), 0, None) for i, t in enumerate(starts)], fast)
+    assert [bool(f & ImuFlag.GAP) for f in s.flags] == [False, True, False, True, False]
+    assert s.t_ns[::2].tolist() == [t + 3_000_000 for t in starts]
 
 
 def test_an_equal_sample_is_kept_and_flagged_as_a_repeat():

@@ -1,21 +1,29 @@
 import queue
 import shutil
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from recorder_bench import Bench, MakeBench, wait_until
 
+from bricktrack_common.errors import StorageError
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Disarmed, Refusal, Reply
 from bricktrack_device.capture.commands import DisarmCommand, Inbox, OtherWork, put_unless_many
 from bricktrack_device.capture.standing_order import ArmOrder, StandingOrder
 from bricktrack_device.config import StorageTable
+from bricktrack_device.storage.run_store import RunStore
 
 NAME = ".armed-unit-1.json"
 
 
 def armed_in(bench: MakeBench, folder: Path, box: Path) -> Bench:
     return bench(storage=StorageTable(folder=str(folder), margin_mb=1, black_box=str(box)))
+
+
+def refuse(*args: object) -> str:
+    raise StorageError("card")
 
 
 def test_a_daemon_that_was_killed_while_armed_arms_again_for_the_same_run_and_says_so(
@@ -51,6 +59,24 @@ def test_what_is_disarmed_or_ended_on_purpose_is_not_armed_again(bench: MakeBenc
     b.arm()
     b.recorder.stop()
     assert not (box / NAME).exists()
+
+
+def test_what_a_killed_daemon_left_is_not_armed_for_after_a_newer_order_was_refused(
+    bench: MakeBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = tmp_path / "box"
+    StandingOrder(box, "unit-1").note(ArmOrder(label="old", duration_s=None))
+    monkeypatch.setattr("bricktrack_device.capture.recorder._RETRY_S", 0.05)
+    monkeypatch.setattr(RunStore, "new_run_id", refuse)
+    b = armed_in(bench, tmp_path, box)
+    wait_until(lambda: "cannot arm itself: card" in b.recorder.status().last_error)
+    assert isinstance(b.ask("arm", "new", None), Refusal)
+    monkeypatch.undo()
+    tried = threading.Event()
+    b.recorder.do_when_idle("looking", tried.set, lambda reply: None)
+    assert tried.wait(60)
+    time.sleep(0.6)  # some times as long as until it would try again
+    assert b.recorder.state == "idle" and b.recorder.status().run_id == ""
 
 
 def test_an_order_is_taken_up_once_and_a_damaged_one_not_at_all(
