@@ -218,9 +218,8 @@ class Recorder:
 
     def _arm_by_itself(self) -> None:
         left = self._order.left
-        session = self._arm(left or ArmOrder(label=self._config.recording.label, duration_s=None))
+        self._arm(left or ArmOrder(label=self._config.recording.label, duration_s=None))
         if left is not None:
-            session.note_armed_again()
             self._order.note(left)
 
     def _arm(self, order: ArmOrder) -> Session:
@@ -247,6 +246,8 @@ class Recorder:
             self._doing = ""
         self._last_error = ""
         self._lost = LostSensors()
+        if order is self._order.left:
+            session.note_armed_again()
         self._change("arm")
         return session
 

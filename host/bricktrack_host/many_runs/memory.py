@@ -6,8 +6,8 @@ from pathlib import Path
 
 _RUN_MEMORY_MB = 550
 _RUN_MEMORY_MB_PER_S = 2.0
-"""More than simulated runs of 1080p took from reading to the report (``scripts/bench_memory.py``): 416 MB at
-16 s, 669 MB at 180 s; half an hour took 2744 MB, its lights found before."""
+"""More than simulated runs of 1080p took from reading to the report (``scripts/bench_memory.py``): 329 MB at
+16 s, 520 MB at 180 s; half an hour took 2744 MB, its lights found before."""
 _MEMORY_SHARE = 0.8
 _CGROUP = Path("/sys/fs/cgroup")
 
