@@ -112,14 +112,14 @@ def test_each_kind_of_picture_has_its_own_noise():
     np.testing.assert_allclose(np.sqrt(told.cov_px2[:, 0, 0, 0]), sd_px, rtol=0.15)
 
 
-def test_where_no_picture_is_coded_for_itself_all_have_one_noise():
+@pytest.mark.parametrize("are_keyframes", [False, True])
+def test_where_no_picture_or_every_one_is_coded_for_itself_all_have_one_noise(are_keyframes):
     R, t = random_poses(40, seed=14)
     observations = seen(R, t, np.random.default_rng(15).normal(0, 0.02, (40, 7, 2)))
     first = start_poses(observations, CAMERA, BRICK)
     errors = frame_errors(observations, first, CAMERA, BRICK, rolling_shutter=False)
-    none = np.zeros(40, dtype=bool)
     np.testing.assert_allclose(
-        with_measured_noise(observations, errors, none).cov_px2,
+        with_measured_noise(observations, errors, np.full(40, are_keyframes)).cov_px2,
         with_measured_noise(observations, errors).cov_px2,
     )
 
@@ -139,18 +139,6 @@ def test_centroids_stated_better_than_the_floor_are_as_noisy_as_their_residuals(
     assert np.nanmin(np.linalg.eigvalsh(told.cov_px2)) > 0
     track = solve_poses(told, CAMERA, BRICK, rolling_shutter=False, first=first)
     assert np.isfinite(track.R_camera_brick).all()
-
-
-def test_where_every_picture_is_coded_for_itself_all_have_one_noise():
-    R, t = random_poses(40, seed=14)
-    observations = seen(R, t, np.random.default_rng(15).normal(0, 0.02, (40, 7, 2)))
-    first = start_poses(observations, CAMERA, BRICK)
-    errors = frame_errors(observations, first, CAMERA, BRICK, rolling_shutter=False)
-    every = np.ones(40, dtype=bool)
-    np.testing.assert_allclose(
-        with_measured_noise(observations, errors, every).cov_px2,
-        with_measured_noise(observations, errors).cov_px2,
-    )
 
 
 def test_the_share_that_stands_still_is_told_from_residuals():

@@ -116,16 +116,16 @@ class _LinearFit:
         """Return what turns that the gyro did not feel add to the covariance of what was found."""
         frames = self.unfelt(slice(0, len(self.error)))
         weight = fitted.weight / fitted.scale
-        pulls = np.zeros((0, self.columns.shape[2]))
+        out = np.zeros(fitted.covariance.shape)
         for first in range(0, len(frames), _STEPS_AT_ONCE):
             some = frames[first : first + _STEPS_AT_ONCE]
             rows, near = self.near(some)
             A = fitted.white[rows, :, :-1] * weight[rows, None, None]
             pull = np.einsum("nk,nip->kip", self.steps(fitted, some, rows, near), A, optimize=True)
             pull *= self.turn_sd_rad[some][:, None, None]
-            pulls = np.concatenate([pulls, pull.reshape(-1, pulls.shape[1])])
-        off = pulls @ fitted.covariance
-        return np.asarray(off.T @ off)
+            off = pull.reshape(-1, len(out)) @ fitted.covariance
+            out += off.T @ off
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
