@@ -116,13 +116,15 @@ class RecordingTable(_Table, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """``[recording]``: how much is kept around the first edge, and whether the unit arms itself.
 
     A run holds ``pre_roll_s`` before t = 0 and ``duration_s + post_roll_s`` after it. With ``auto_arm``
-    the unit arms at start and after every saved run, until it is disarmed by command.
+    the unit arms at start and after every saved run, until it is disarmed by command. A daemon that was
+    killed while a host's command had it armed arms again within ``arm_again_within_s`` of that command.
     """
 
     duration_s: Annotated[float, msgspec.Meta(gt=0, le=600)] = 15.0
     pre_roll_s: Annotated[float, msgspec.Meta(ge=0, le=60)] = 0.5
     post_roll_s: Annotated[float, msgspec.Meta(ge=0, le=60)] = 0.5
     auto_arm: bool = False
+    arm_again_within_s: Annotated[float, msgspec.Meta(ge=0, le=604_800)] = 43_200.0
     label: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,32}$")] = ""
 
 

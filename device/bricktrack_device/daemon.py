@@ -11,7 +11,6 @@ from bricktrack_common.errors import StorageError
 from bricktrack_common.key_files import fingerprint
 from bricktrack_device.capture.black_box import black_box_folder
 from bricktrack_device.capture.recorder import Recorder
-from bricktrack_device.capture.standing_order import StandingOrder
 from bricktrack_device.config import DeviceConfig
 from bricktrack_device.health.watch import HealthWatch
 from bricktrack_device.interfaces import Rig
@@ -81,7 +80,7 @@ class Daemon:
                 self._heed_signals()
             service.health.refresh_if_due(recorder.state)
             # One that was killed while armed tries its sensors by arming: every second counts.
-            if not StandingOrder(black_box_folder(self._config), self._config.unit.name).is_kept:
+            if not recorder.will_arm_again:
                 notify("STATUS=trying the sensors")
                 service.health.test_hardware(self._stop.is_set)
             advertisement = self._advertisement(server.port, keys)

@@ -79,7 +79,11 @@ def in_time(what: str, action: Callable[[], T], timeout_s: float, *, beat: Calla
     Exception
         What the call raised.
     """
-    call = ThreadedCall(action, name=what)
+    return result_in_time(what, ThreadedCall(action, name=what), timeout_s, beat=beat)
+
+
+def result_in_time(what: str, call: ThreadedCall[T], timeout_s: float, *, beat: Callable[[], None]) -> T:
+    """Return what a call returns that was started before; see `in_time`."""
     deadline_ns = monotonic_ns() + round(timeout_s * 1e9)
     while not call.has_ended(within_s=_POLL_S):
         if monotonic_ns() > deadline_ns:

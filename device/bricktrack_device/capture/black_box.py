@@ -84,6 +84,10 @@ class BlackBox:
         """Of which run there is a copy; ``""`` if there is none."""
         return "" if self._run is None else self._run.name
 
+    def has(self, run_id: str) -> bool:
+        """Tell whether there is anything in the copy of a run that a daemon left."""
+        return self.folder is not None and (self.folder / run_id / DRAFT_NAME).exists()
+
     def bring_in(self, store: RunStore) -> None:
         """Put on the card what a daemon left that was killed; see `storage.recovery`."""
         self._let_go()

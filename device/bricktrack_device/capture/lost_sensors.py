@@ -32,7 +32,7 @@ class LostSensors:
         if not session.has_sensors:
             found = "no sensor is left: " + "; ".join(session.missing)
         elif auto_arm and (lost := session.lost_required):
-            found = f"lost while armed: {lost}. The unit will arm itself again"
+            found = f"lost while armed: {lost}"
         if not found:
             self._since_s = None
             return ""

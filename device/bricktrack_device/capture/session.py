@@ -180,13 +180,13 @@ class Session:
 
     @property
     def has_sensors(self) -> bool:
-        """Whether anything still delivers."""
-        return not self.camera.problem or any(i.is_ready for i in self.imus)
+        """Whether anything delivers now."""
+        return not self.camera.problem or any(i.is_ready and not i.silence for i in self.imus)
 
     @property
     def lost_required(self) -> str:
-        """What the configuration requires and does not deliver any more, in words; empty if all is well."""
-        lost = [f"imu {i.name}: {i.problem}" for i in self.imus if i.settings.required and i.problem]
+        """What the configuration requires and does not deliver now, in words; empty if all is well."""
+        lost = [f"imu {i.name}: {i.silence}" for i in self.imus if i.settings.required and i.silence]
         if self._config.camera.required and (problem := self.camera.problem):
             lost.insert(0, f"camera: {problem}")
         return "; ".join(lost)
@@ -235,11 +235,11 @@ class Session:
         self._trigger_triplet = read_clock_triplet()
         self.log.add("first edge", t0_ns=self.t0_ns)
 
-    def note_armed_again(self) -> None:
-        """Say that the daemon was killed while armed, and armed again: the wave may have begun in between."""
+    def note_armed_again(self, why: str) -> None:
+        """Say that the unit was armed before and was not for a while; ``why`` is in words."""
         self._note_missing(
-            "the daemon was killed while it was armed, and armed itself again: edges before that were not "
-            "heard, t = 0 may be a later one than the first"
+            f"{why}; the unit armed itself again: edges in between were not heard, t = 0 may be a later one "
+            "than the first"
         )
 
     def note_bug(self, words: str) -> bool:

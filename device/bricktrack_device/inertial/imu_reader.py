@@ -124,6 +124,11 @@ class ImuReader:
         return self._ready is not None and not self._problem
 
     @property
+    def silence(self) -> str:
+        """Why no samples come now, in words, or ``""``; a sensor whose bus hangs may come again."""
+        return self._problem or self._stall_words
+
+    @property
     def warnings(self) -> list[str]:
         """What the set-up found that does not stop the sensor."""
         return [] if self._ready is None else self._ready.facts.warnings

@@ -138,7 +138,9 @@ def _bring_in(copy: Path, store: RunStore) -> bool:
 def _put_on_card(copy: Path, run_id: str, store: RunStore) -> bool:
     """Copy what is in memory beside its final name, and do away with it; tell whether that worked."""
     unfinished = store.runs / (run_id + PARTIAL_SUFFIX)
-    if not (store.runs / run_id).exists() and not _is_whole(unfinished):
+    if not (copy / DRAFT_NAME).exists():
+        logger.warning("%s: the daemon was killed before anything was in it", copy)
+    elif not (store.runs / run_id).exists() and not _is_whole(unfinished):
         try:
             if not unfinished.is_dir():
                 store.disk.make_folder(unfinished)

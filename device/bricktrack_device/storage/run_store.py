@@ -33,6 +33,7 @@ from bricktrack_common.run_manifest import (
 )
 from bricktrack_common.typed_data import dump_json, load_json
 from bricktrack_common.wire_messages import FileSummary, RunDescription, RunSummary
+from bricktrack_device.boot import kernel_boot_id
 from bricktrack_device.refusals import RequestRefusedError
 from bricktrack_device.storage.confirmations import Confirmations
 from bricktrack_device.storage.disk import Disk, storage_error
@@ -94,7 +95,7 @@ class RunStore:
         self.folder = folder
         self.unit = unit
         self.disk = disk or Disk()
-        self._boot = (boot_id or _kernel_boot_id()).replace("-", "")[:6]
+        self._boot = (boot_id or kernel_boot_id()).replace("-", "")[:6]
         self._lock = threading.Lock()
         self._folder_lock: FolderLock | None = None
         self._runs_known: dict[str, _KnownRun] = {}
@@ -173,6 +174,13 @@ class RunStore:
         except OSError as e:
             raise storage_error(f"{path}: the run counter cannot be written", e) from e
         return f"{self.unit}_{self._boot}_{number:04d}" + (f"_{label}" if label else "")
+
+    def has(self, run_id: str) -> bool:
+        """Tell whether anything of a run is on the card, whole or not; no where the card does not tell."""
+        try:
+            return any((self.runs / name).exists() for name in (run_id, run_id + PARTIAL_SUFFIX))
+        except OSError:
+            return False
 
     def is_own(self, run_id: str) -> bool:
         """Tell whether a run is named as those of this unit are."""
@@ -357,7 +365,3 @@ class RunStore:
 def _counter_of(name: str) -> int:
     found = _COUNTER_IN_ID.search(name)
     return int(found.group(1)) if found else 0
-
-
-def _kernel_boot_id() -> str:
-    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()

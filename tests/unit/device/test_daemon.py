@@ -16,6 +16,7 @@ from device_fakes import FakeCamera, FakeRig
 from saved_runs import confirmed_run, store_in
 
 from bricktrack_common.checksums import crc32, sha256_bytes
+from bricktrack_common.clocks import monotonic_ns
 from bricktrack_common.errors import DeviceError, StorageError
 from bricktrack_common.wire_codec import decode_reply, encode_message
 from bricktrack_common.wire_messages import (
@@ -203,12 +204,20 @@ def test_a_daemon_that_was_killed_while_armed_arms_before_it_tries_its_sensors(
     tried = []
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     monkeypatch.setattr(HealthWatch, "test_hardware", lambda *a: tried.append(a))
-    StandingOrder(tmp_path / "black-box", "unit-1").note(ArmOrder(label="impact", duration_s=None))
+    order = StandingOrder(tmp_path / "black-box", "unit-1", max_age_s=60.0, has_run=lambda run_id: False)
+    order.note(ArmOrder(label="impact", duration_s=None), "unit-1_000000_0001_impact")
     with closing(Unit(tmp_path / "card")) as unit:
         unit.wait(lambda: unit.status().state == "armed")
         assert unit.status().run_id.endswith("_impact") and tried == []
     with closing(Unit(tmp_path / "card")) as unit:  # it was ended on purpose
         assert unit.status().state == "idle" and len(tried) == 1
+    week_ns = 7 * 86_400 * 10**9
+    order.note(
+        ArmOrder(label="old", duration_s=None, t_ns=monotonic_ns() - week_ns), "unit-1_000000_0002_old"
+    )
+    with closing(Unit(tmp_path / "card")) as unit:
+        unit.wait(lambda: "'old', and is not armed again" in unit.status().last_error)
+        assert unit.status().state == "idle" and len(tried) == 2
 
 
 def test_disarm_answers_and_unknown_runs_are_refused(unit: Unit) -> None:

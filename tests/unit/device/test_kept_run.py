@@ -9,7 +9,7 @@ from recorder_bench import MakeBench
 
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Disarmed, Refusal
-from bricktrack_device.capture import recorder as recorder_module
+from bricktrack_device.capture import run_cycle
 from bricktrack_device.storage.disk import Disk
 
 
@@ -54,7 +54,7 @@ def test_a_full_card_ends_in_fault_with_a_reason_and_the_run_is_saved_once_there
 def test_a_run_kept_in_memory_is_saved_by_itself_when_space_comes_back(
     bench: MakeBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder_module, "_RETRY_S", 0.1)
+    monkeypatch.setattr(run_cycle, "_RETRY_S", 0.1)
     disk = FillableDisk()
     b = bench(disk=disk)
     armed = b.arm()

@@ -2,17 +2,17 @@ import time
 from pathlib import Path
 
 import pytest
-from device_fakes import FakeCamera, FakeRig
+from device_fakes import FakeBusOpener, FakeCamera, FakeRig
 from recorder_bench import MakeBench, wait_until
 
 from bricktrack_common.errors import HardwareError
 from bricktrack_common.run_folder import read_run
 from bricktrack_common.wire_messages import Disarmed, Refusal
-from bricktrack_device.capture import lost_sensors
-from bricktrack_device.capture import recorder as recorder_module
+from bricktrack_device.capture import lost_sensors, run_cycle
 from bricktrack_device.capture import session as session_module
 from bricktrack_device.capture.session import Session
 from bricktrack_device.config import (
+    CameraTable,
     ImuTable,
     RecordingTable,
     StorageTable,
@@ -92,7 +92,7 @@ def test_a_bug_while_recording_ends_in_fault_once_the_whole_window_is_saved(
 def test_a_unit_that_arms_itself_leaves_an_armed_state_that_lost_its_camera(
     bench: MakeBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder_module, "_RETRY_S", 0.05)
+    monkeypatch.setattr(run_cycle, "_RETRY_S", 0.05)
     monkeypatch.setattr(lost_sensors, "PATIENCE_S", 0.2)
     camera = FakeCamera(silent_after=20)
     recording = RecordingTable(duration_s=0.5, pre_roll_s=0.2, post_roll_s=0.1, auto_arm=True)
@@ -106,6 +106,48 @@ def test_a_unit_that_arms_itself_leaves_an_armed_state_that_lost_its_camera(
     b.wait_for("recording")
     wait_until(lambda: b.store.count_runs() == 1)
     assert b.store.list_runs()[0].state == "complete"
+
+
+def test_a_unit_that_arms_itself_again_does_so_for_the_hosts_order(
+    bench: MakeBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_cycle, "_RETRY_S", 0.05)
+    monkeypatch.setattr(lost_sensors, "PATIENCE_S", 0.2)
+    camera = FakeCamera()
+    recording = RecordingTable(duration_s=0.5, pre_roll_s=0.2, post_roll_s=0.1, auto_arm=True, label="own")
+    b = bench(rig=FakeRig(camera=camera), recording=recording)
+    b.wait_for("armed")
+    assert isinstance(b.ask("disarm"), Disarmed)
+    first = b.arm("impact", 0.3).run_id
+    camera.silent_after = 1
+    b.wait_for("fault")
+    assert "will arm itself again" in b.recorder.status().reason
+    camera.silent_after = None
+    b.wait_for("armed")
+    second = b.recorder.status().run_id
+    assert first.endswith("_impact") and second.endswith("_impact") and first != second
+    b.rig.pulse(3)
+    wait_until(lambda: b.store.count_runs() == 1)
+    m = read_run(b.store.runs / second, verify_hashes=True).manifest
+    assert m.trigger.t0_ns is not None and m.window_ns is not None
+    assert m.window_ns[1] - m.trigger.t0_ns == 400_000_000  # the host's 0.3 s and 0.1 s after it
+    assert any("edges in between were not heard" in words for words in m.missing)
+    b.wait_for("armed")  # the order is carried out: the next run is the unit's own
+    assert b.recorder.status().run_id.endswith("_own") and "again" not in b.recorder.status().reason
+
+
+def test_a_unit_whose_only_sensor_hangs_is_in_fault_after_as_long_as_one_without_pictures(
+    bench: MakeBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lost_sensors, "PATIENCE_S", 0.5)
+    rig = FakeRig(camera=FakeCamera(fail="unplugged"), buses={"a": FakeBusOpener(hang_after=60)})
+    camera = CameraTable(required=False)
+    b = bench(rig=rig, camera=camera, imu=[ImuTable(name="brick", bus="a")])
+    b.arm()
+    b.wait_for("fault")
+    reason = b.recorder.status().reason
+    assert "no sensor is left: camera: unplugged; imu brick: its sampler hangs" in reason
+    assert reason.count("its sampler hangs") == 1  # its reader, who gives it up after 5 s, has not spoken
 
 
 def test_a_unit_that_a_host_armed_stays_armed_without_its_camera_and_says_so(

@@ -140,8 +140,8 @@ def test_a_bug_whose_words_are_new_each_time_fills_no_memory(
     b = bench()
     b.arm()
     wait_until(lambda: len(looks) > 40)
-    assert b.recorder._session is not None
-    assert len(b.recorder._session.missing) == 20
+    assert b.recorder._cycle.session is not None
+    assert len(b.recorder._cycle.session.missing) == 20
 
 
 def test_a_bug_in_one_part_of_a_run_does_not_cost_the_others(
@@ -169,7 +169,7 @@ def test_a_pin_that_cannot_be_given_back_costs_no_run(
 ) -> None:
     b = bench(imu=[ImuTable(name="brick", bus="a")])
     armed = b.arm()
-    session = b.recorder._session
+    session = b.recorder._cycle.session
     assert session is not None and session.trigger is not None
 
     def fail() -> None:
@@ -204,7 +204,7 @@ def test_a_bug_in_stopping_the_camera_leaves_no_sampler_behind(bench: MakeBench)
     camera = FakeCamera()
     b = bench(rig=FakeRig(camera=camera), imu=[ImuTable(name="brick", bus="a")])
     b.arm()
-    session = b.recorder._session
+    session = b.recorder._cycle.session
     assert session is not None
     reader = session.imus[0]
     camera.stop_error = RuntimeError("a bug")
