@@ -15,9 +15,9 @@ from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
-import cv2
 import numpy as np
 from identity_frames import BESIDE_PX, HEADER, N_FALSE, fitted_brick, one_beside_in, searched, tracked
+from pose_peers import each, other_solvers
 
 from bricktrack_common.arrays import BoolArray, FloatArray
 from bricktrack_common.brick_model import BrickModel
@@ -54,6 +54,7 @@ def main() -> int:
     print(
         "RMSE over the bound                     rot x  rot y  rot z      x      y      z   failed   NEES/6"
     )
+    solvers = other_solvers()
     for noise in NOISES_PX:
         rng = np.random.default_rng([args.seed, round(1000 * noise)])
         rays = camera.calibrated(noise_px=noise, rng=rng)
@@ -77,9 +78,9 @@ def main() -> int:
         print(f"         the same, dots without noise {clean}")
         print(f"         PRSOI alone, dots            {raw}")
         few = Scene.random(OTHERS, brick, camera, noise, rng)
-        for name, solve in other_solvers().items():
+        for name, solve in solvers.items():
             tally = Tally()
-            R, t = each(few, camera, solve)
+            R, t = each(few.uv, brick.led_positions_mm, camera, solve)
             tally.add(few, R, t, None)
             print(f"         {name:28s} {tally}")
     identities(args.searches, args.seed, brick, camera)
@@ -157,82 +158,6 @@ class Tally:
         ratio = np.sqrt(self.squares / max(self.n, 1))
         nees = f"{self.nees / self.n / 6:8.3f}" if self.has_covariance else "       -"
         return "  ".join(f"{r:5.3f}" for r in ratio) + f"  {self.failed:7d} {nees}"
-
-
-Solver = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray] | None]
-"""LEDs (n, 3), mm, and their true slopes x/z, y/z (n, 2) -> R and t, or None."""
-
-
-def other_solvers() -> dict[str, Solver]:
-    """Return OpenCV's solvers and, where installed, PoseLib's."""
-    unit = np.eye(3)
-
-    def refined(p: FloatArray, s: FloatArray, ok: bool, r: FloatArray, t: FloatArray) -> bool:
-        if ok:
-            cv2.solvePnPRefineLM(p, s, unit, None, r, t)
-        return ok
-
-    def opencv(flag: int, *, then_lm: bool) -> Solver:
-        def solve(p: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-            use = slice(None)
-            if flag == cv2.SOLVEPNP_IPPE:  # planar points only: the six that are, then all by LM
-                use = np.flatnonzero(np.abs(p[:, 2]) < 1e-6)
-            try:
-                ok, r, t = cv2.solvePnP(p[use], s[use], unit, None, flags=flag)
-            except cv2.error:
-                return None
-            if then_lm:
-                refined(p, s, ok, r, t)
-            return (cv2.Rodrigues(r)[0], t.ravel()) if ok else None
-
-        return solve
-
-    solvers = {
-        "OpenCV SQPNP": opencv(cv2.SOLVEPNP_SQPNP, then_lm=False),
-        "OpenCV EPNP": opencv(cv2.SOLVEPNP_EPNP, then_lm=False),
-        "OpenCV IPPE, LM": opencv(cv2.SOLVEPNP_IPPE, then_lm=True),
-    }
-    try:
-        import poselib
-    except ImportError:
-        print("PoseLib is not installed (pip install poselib): left out", file=sys.stderr)
-        return solvers
-    focal = 1600.0  # its thresholds are in pixels
-    model = {"model": "SIMPLE_PINHOLE", "width": 1920, "height": 1080, "params": [focal, 0.0, 0.0]}
-
-    def by_poselib(p: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        options = {"max_reproj_error": 5.0, "max_error": 5.0}
-        pose, _ = poselib.estimate_absolute_pose(list(s * focal), list(p), model, options, {})
-        return np.asarray(pose.R), np.asarray(pose.t)
-
-    solvers["PoseLib"] = by_poselib
-    return solvers
-
-
-def each(scene: Scene, camera: TrueCamera, solve: Solver) -> tuple[FloatArray, FloatArray]:
-    """Solve frame by frame with the true lens taken off."""
-    n = len(scene.R)
-    R, t = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
-    slopes = true_slopes(camera, scene.uv)
-    for i in range(n):
-        found = solve(scene.brick.led_positions_mm, slopes[i])
-        if found is not None:
-            R[i], t[i] = found
-    return R, t
-
-
-def true_slopes(camera: TrueCamera, uv: FloatArray) -> FloatArray:
-    """Invert the true lens by Newton's method with differences, to 1e-12."""
-    s = (uv - [camera.cx_px, camera.cy_px]) / camera.focal_px
-
-    def at(slopes: FloatArray) -> FloatArray:
-        return camera.project(np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1))
-
-    for _ in range(6):
-        h = 1e-5
-        J = np.stack([(at(s + h * e) - at(s - h * e)) / (2 * h) for e in np.eye(2)], axis=-1)
-        s = s + np.linalg.solve(J, (uv - at(s))[..., None])[..., 0]
-    return s
 
 
 def identities(n: int, seed: int, brick: BrickModel, camera: TrueCamera) -> None:
