@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
+from matplotlib.patches import Polygon, Rectangle
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 
 from bricktrack_common.arrays import FloatArray
@@ -22,6 +22,9 @@ from bricktrack_host.reporting.plots import FUSED, IMPACT, INK, OPTICAL, TRUTH
 
 COLOURS = "viridis"
 _COLOUR_BAR_IN = 0.78
+TYPICAL_ARROW, LONGEST_ARROW = 0.7, 8.0
+"""Of a residual as great as the median, in dot distances, and of the greatest at most."""
+LONGEST_MOVE_PX = 120
 LONGEST_SIDE = 4.0
 """Triangles between dots with a longer side, in dot distances, span a gap: nothing is drawn in them."""
 
@@ -43,12 +46,15 @@ def residual_contour_figure(planes: Planes, residual_mm: Sequence[FloatArray]) -
 def residual_arrow_figure(planes: Planes, residual_mm: Sequence[FloatArray]) -> Figure:
     """Return the residuals of each plane as arrows: a pattern in them is a misfit, none is noise."""
     fig, axes = _plane_panels(planes)
-    typical = float(np.median(np.concatenate([np.hypot(*r.T) for r in residual_mm])))
+    sizes = np.concatenate([np.hypot(*r.T) for r in residual_mm])
+    one_mm = max(float(np.median(sizes)) / TYPICAL_ARROW, float(sizes.max()) / LONGEST_ARROW, 1e-9)
     for ax, (z_mm, seen), r in zip(axes, planes, residual_mm, strict=True):
         step = _spacing(seen.xy_mm)
-        ax.quiver(*seen.xy_mm.T, *r.T, angles="xy", scale_units="xy",
-                  scale=max(typical, 1e-9) / (0.7 * step), width=0.0016, color=OPTICAL)  # fmt: skip
-        ax.set_title(f"z = {z_mm:g} mm: an arrow of one dot distance is {1e3 * typical / 0.7:.1f} µm")
+        ax.quiver(*seen.xy_mm.T, *r.T, angles="xy", scale_units="xy", scale=one_mm / step, width=0.0016,
+                  color=OPTICAL)  # fmt: skip
+        ax.update_datalim(seen.xy_mm + r * step / one_mm)
+        ax.autoscale_view()
+        ax.set_title(f"z = {z_mm:g} mm: an arrow of one dot distance is {1e3 * one_mm:.1f} µm")
         _plane_labels(ax)
     return fig
 
@@ -171,9 +177,12 @@ def comparison_figure(comparison: CalibrationComparison, mode: SensorMode) -> Fi
         size = 1e3 * np.hypot(*moved.T)
         longest = max(float(size.max()), 1e-6)
         ax.quiver(*comparison.uv_px[every].T, *(1e3 * moved[every]).T, angles="xy", scale_units="xy",
-                  scale=longest / 120, width=0.0018, color=FUSED)  # fmt: skip
+                  scale=longest / LONGEST_MOVE_PX, width=0.0018, color=FUSED)  # fmt: skip
+        ax.add_patch(Rectangle((-0.5, -0.5), mode.width, mode.height, fc="none", ec=INK, lw=0.6))
         ax.set_title(f"{words}: rms {np.sqrt(np.mean(size**2)):.1f}, longest arrow {longest:.1f} µm")
-        ax.set(xlim=(-0.5, mode.width - 0.5), ylim=(mode.height - 0.5, -0.5), xlabel="u, px", ylabel="v, px")
+        beside = LONGEST_MOVE_PX + 0.5  # arrows begin up to the picture's border
+        ax.set(xlim=(-beside, mode.width + beside), ylim=(mode.height + beside, -beside),
+               xlabel="u, px", ylabel="v, px")  # fmt: skip
     return fig
 
 
