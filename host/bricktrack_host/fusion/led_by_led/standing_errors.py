@@ -4,9 +4,9 @@ What calibration, layout and profile leave of error in a centroid hardly changes
 few millimetres, and slowly as it turns. Taken for noise it would average out over the frames, as it does not;
 taken for nothing the noise would be overstated; and what changes with the view is taken for a pose that is
 off where it is believed to be constant, the more firmly the better the samples know how the brick turned. So
-a centroid's error is a noise that is new in every picture, and a part that stands still: of the profile and
-of the picture's size, common to all LEDs, and of each LED for itself, at each view its own. How
-large the latter is the LEDs say among themselves (`leds_among_themselves`).
+a centroid's error is a noise that is new in every picture, and a part that stands still: of the profile, of
+the shape at each angle and of the picture's size, common to all LEDs, and of each LED for itself, at each
+view its own. How large the latter is the LEDs say among themselves (`leds_among_themselves`).
 
 Like the errors of the inertial sensor (`sensor_errors`, which see for the method) these need not be states of
 the filter: one weighted least squares over the run gives them, and what stays unsure of them makes the motion
@@ -22,7 +22,7 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led.led_measurements import Pictured, SeenLeds
 from bricktrack_host.fusion.led_by_led.leds_among_themselves import AmongThemselves
-from bricktrack_host.fusion.led_by_led.shape_errors import shape_covariance_px2
+from bricktrack_host.fusion.led_by_led.shape_errors import N_SHAPES, shape_shifts_px
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Run
 from bricktrack_host.fusion.smoothing.camera_errors import CameraErrors, CameraWay, camera_prior_sd
 from bricktrack_host.fusion.smoothing.sensor_errors import N_ERRORS, SensorErrors, sensor_prior_sd
@@ -31,8 +31,8 @@ from bricktrack_host.fusion.smoothing.standing_doubt import ARM, Doubt, ErrorWay
 from bricktrack_host.fusion.smoothing.standing_errors_kernel import N_GAINS, Sight
 from bricktrack_host.tracking.pose.refine import OWN_SHARE
 
-_PROFILE, _SCALE, _SPREAD, _SMEAR = range(N_ERRORS, N_ERRORS + 4)
-_FIRST_LED = N_ERRORS + 4
+_PROFILE, _SCALE, _SPREAD, _SMEAR, _SHAPE = range(N_ERRORS, N_ERRORS + 5)
+_FIRST_LED = _SHAPE + N_SHAPES
 N_VIEWS = 6  # see `_by_view`
 _N_LINEAR = 3
 _CURVED_TELLS = 0.2
@@ -65,13 +65,14 @@ another renderer than this project's had 1.4 times as much on the median (simula
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandingErrors:
-    """Errors that stand still, in one vector of q = 25 + 2 V L, or 48 + 2 V L where the camera moves.
+    """Errors that stand still, in one vector of q = 30 + 2 V L, or 53 + 2 V L where the camera moves.
 
     In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
     the profile's, in units of its stated sd; the picture's size over what it should be, less 1; how far
     acceleration draws the centroid, likewise, which is not estimated and stays 0; how far the smear draws it,
-    over the smear; (u, v) of each of L LEDs, px, and V - 1 times as many that change with the view, see
-    `_by_view`; those of the sensor that moves with the camera, as in `CameraErrors.values`.
+    over the smear; what the shape shows at other angles, in units of `shape_shifts_px`; (u, v) of each of L
+    LEDs, px, and V - 1 times as many that change with the view, see `_by_view`; those of the sensor that
+    moves with the camera, as in `CameraErrors.values`.
 
     Attributes
     ----------
@@ -129,15 +130,12 @@ class StandingPrior:
         Zero where none are believed.
     led_shift_px : ndarray, shape (L, 2)
         One standard deviation of each LED's profile, of which a share is its own.
-    shape_px2 : ndarray, shape (2 L, 2 L)
-        Of LEDs seen at other angles than the profile was fitted at; see `shape_errors`.
     camera_sd : ndarray, shape (23,), or (0,) where the camera stands still
     n_views : int
     """
 
     sensor_sd: FloatArray
     led_shift_px: FloatArray
-    shape_px2: FloatArray
     camera_sd: FloatArray
     n_views: int
 
@@ -154,14 +152,9 @@ class StandingPrior:
     ) -> "StandingPrior":
         """Return the belief for a run: the profile's share as it is on the mean over the run."""
         count = np.maximum(np.bincount(leds.led, minlength=n_leds), 1)
-        angle_rad = np.arccos(np.clip(pictured.facing, -1.0, 1.0))
-        mean = [
-            np.bincount(leds.led, part, minlength=n_leds) / count
-            for part in (angle_rad, *pictured.side_on_px.T, *pictured.profile_shift_px.T)
-        ]
-        shape_px2 = shape_covariance_px2(mean[0], np.stack(mean[1:3], axis=1))
+        mean = [np.bincount(leds.led, part, minlength=n_leds) / count for part in pictured.profile_shift_px.T]
         camera_sd = camera_prior_sd(settings) if camera_moves else np.zeros(0)
-        return cls(sensor_prior_sd(settings), np.stack(mean[3:], axis=1), shape_px2, camera_sd, n_views)
+        return cls(sensor_prior_sd(settings), np.stack(mean, axis=1), camera_sd, n_views)
 
     def covariance(self, offset_sd_px: ArrayLike, change_sd_px: ArrayLike) -> FloatArray:
         """Return the covariance of all, shape (..., q, q), where single LEDs are off by so much (...).
@@ -174,7 +167,7 @@ class StandingPrior:
         q = by_view.stop + len(self.camera_sd)
         out = np.zeros((*np.broadcast_shapes(np.shape(offset_sd_px), np.shape(change_sd_px)), q, q))
         at = np.arange(q)
-        of_all = [1.0, _SCALE_SD**2, 0.0, _SMEAR_SD**2]
+        of_all = [1.0, _SCALE_SD**2, 0.0, _SMEAR_SD**2, *np.ones(N_SHAPES)]
         out[..., at, at] = np.concatenate(
             [self.sensor_sd**2, of_all, np.zeros(self.n_views * own.size), self.camera_sd**2]
         )
@@ -182,7 +175,6 @@ class StandingPrior:
             part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
             out[..., part, part] = np.outer(shift, shift)
         of_leds = at[_FIRST_LED:last_led]
-        out[..., of_leds[:, None], of_leds] += self.shape_px2
         out[..., of_leds, of_leds] += np.square(offset_sd_px)[..., None]
         of_profile = np.tile(np.repeat(0.5 * np.square(own).sum(axis=1), 2), self.n_views - 1)
         out[..., at[by_view], at[by_view]] = np.square(change_sd_px)[..., None] + of_profile
@@ -288,16 +280,15 @@ def _by_view(pictured: Pictured, n_views: int) -> FloatArray:
 
 
 def _of_all_leds(pictured: Pictured) -> FloatArray:
-    """Return what each error that all LEDs share moves their centroids by, shape (m, 2, 4), px."""
-    return np.stack(
-        [
-            pictured.profile_shift_px,
-            pictured.from_centre_px,
-            pictured.accelerated_px,
-            pictured.leaning_px,
-        ],
-        axis=2,
-    )
+    """Return what each error that all LEDs share moves their centroids by, shape (m, 2, 4 + N_SHAPES), px."""
+    of_all = [
+        pictured.profile_shift_px,
+        pictured.from_centre_px,
+        pictured.accelerated_px,
+        pictured.leaning_px,
+    ]
+    shapes = shape_shifts_px(pictured.facing, pictured.side_on_px)
+    return np.concatenate([np.stack(of_all, axis=2), shapes], axis=2)
 
 
 def _likeliest(
