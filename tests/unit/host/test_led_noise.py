@@ -10,11 +10,13 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led import led_noise
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_noise import (
+    ALL_NEW,
     STATED_SCALES,
     InertialNoise,
     believed_covariance_px2,
     centroid_scales,
     choose_inertial_noise,
+    pictures_alike,
     still_sightings,
 )
 from bricktrack_host.fusion.pose_by_pose.inertial_noise import NoiseLevel, NoiseParts
@@ -47,15 +49,50 @@ def test_a_picture_that_moves_is_no_surer_than_one_at_rest():
     leds = sightings([0, 1, 2, 3], [1, 1, 1, 1], [700.0, 700.1, 710.0, 740.0])
     leds.cov_px2[2:] = np.diag([0.01, 0.002]), np.diag([0.4, 0.05])  # stated: the more, the longer the smear
     still = still_sightings(leds)
-    found = believed_covariance_px2(leds, still, np.array([0.2, 0.5]))
+    found = believed_covariance_px2(leds, still, np.array([0.2, 0.5]), ALL_NEW)
     np.testing.assert_allclose(found[:2], np.tile(0.25e-3 * np.eye(2), (2, 1, 1)), rtol=1e-12)
     # 0.2^2 of what is stated, and of the 0.5^2 at rest what 0.2^2 leaves out.
     np.testing.assert_allclose(found[2], np.diag([0.0004 + 0.00021, 0.00008 + 0.00021]), rtol=1e-12)
     np.testing.assert_allclose(found[3], np.diag([0.016 + 0.00021, 0.002 + 0.00021]), rtol=1e-12)
     # Surer at rest, as where errors repeat: nothing is added to those that move.
-    found = believed_covariance_px2(leds, still, np.array([0.8, 0.3]))
+    found = believed_covariance_px2(leds, still, np.array([0.8, 0.3]), ALL_NEW)
     np.testing.assert_allclose(found[3], 0.64 * leds.cov_px2[3], rtol=1e-12)
     np.testing.assert_allclose(found[0], 0.09 * leds.cov_px2[0], rtol=1e-12)
+    # An error that is one in four pictures, or six at rest: they are believed as one.
+    found = believed_covariance_px2(leds, still, np.ones(2), np.array([4.0, 6.0]))
+    np.testing.assert_allclose(found[[0, 3]], leds.cov_px2[[0, 3]] * [[[6.0]], [[4.0]]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.5, 0.8])
+def test_errors_that_fade_from_picture_to_picture_are_found(alike):
+    # Each is so much of the last one's: (1 + r) / (1 - r) of them are one. Cut off where they hardly agree.
+    n_frames, n_leds = 400, 7
+    leds = sightings(
+        np.repeat(np.arange(n_frames), n_leds), np.tile(np.arange(n_leds), n_frames), 10.0 * np.arange(2800)
+    )
+    rng, off_px = np.random.default_rng(4), np.zeros((n_frames, n_leds, 2))
+    for i in range(1, n_frames):
+        off_px[i] = alike * off_px[i - 1] + np.sqrt(1 - alike**2) * rng.normal(size=(n_leds, 2))
+    off_px[50, 3] = 100.0  # an outlier says nothing
+    off_px[:, 5] += 7.0  # and what stands beside its place all the time is no noise
+    still = leds.frame >= 300
+    found = pictures_alike(0.02 * off_px.reshape(-1, 2), leds, still, np.ones(len(still), dtype=bool))
+    assert found[0] == pytest.approx((1 + alike) / (1 - alike), rel=0.2)
+    assert found[1] >= found[0]
+    # What is not used, and a few sightings, say nothing.
+    few = leds.frame < 5
+    np.testing.assert_array_equal(pictures_alike(off_px.reshape(-1, 2), leds, still, few), ALL_NEW)
+
+
+def test_errors_at_rest_are_no_newer_than_those_of_a_picture_that_moves():
+    n_frames = 200
+    leds = sightings(np.arange(n_frames), np.zeros(n_frames, dtype=int), 10.0 * np.arange(n_frames))
+    off_px = np.repeat(np.random.default_rng(5).normal(size=(n_frames // 10, 2)), 10, axis=0)
+    off_px[100:] = np.random.default_rng(6).normal(size=(100, 2))
+    still, use = leds.frame >= 100, np.ones(n_frames, dtype=bool)
+    found = pictures_alike(off_px, leds, still, use)
+    assert found[0] > 5
+    assert found[1] == found[0]
 
 
 def chi2_of(scale, n, rng):

@@ -18,9 +18,13 @@ from bricktrack_host.fusion.smoothing.smoother import Problem, score_noise
 from bricktrack_host.fusion.smoothing.smoother_kernel import NIS_CAP
 
 STATED_SCALES = np.ones(2)
+ALL_NEW = np.ones(2)  # `pictures_alike` of noise that is new in each picture
 _STILL_PX = 0.3
 _MIN_SIGHTINGS = 60
 _LEAST_SCALE = 0.1
+_MOST_LAG = 30
+_LEAST_ALIKE = 0.05  # correlation from which on errors are new: of 1000 sightings it is known to 0.02
+_ODD_SDS = 3.0  # what is farther off says no more
 _CHI_2_MEDIAN = 1.386  # median of chi-square with 2 degrees of freedom
 _STEP = 2.0
 _EARN_PER_STEP = 2.0  # log-likelihood that a step away from what is stated must earn
@@ -44,11 +48,14 @@ def still_sightings(leds: SeenLeds) -> BoolArray:
     return still
 
 
-def believed_covariance_px2(leds: SeenLeds, still: BoolArray, scales: FloatArray) -> FloatArray:
+def believed_covariance_px2(
+    leds: SeenLeds, still: BoolArray, scales: FloatArray, pictures_alike: FloatArray
+) -> FloatArray:
     """Return the covariance of centroids whose stated sd is off by ``scales``, shape (m, 2, 2), px^2.
 
     ``still``, shape (m,), says which are of pictures at rest; ``scales``, shape (2,), hold what those of
-    moving pictures and of such at rest are multiplied by.
+    moving pictures and of such at rest are multiplied by, and ``pictures_alike``, shape (2,), in how many of
+    them in a row the error is one: so many are believed as much as one would be.
 
     What is stated of a picture that moves is mostly its smear, and may be several times too much. What a
     picture at rest is unsure by, one that moves slowly is unsure by as well.
@@ -58,7 +65,7 @@ def believed_covariance_px2(leds: SeenLeds, still: BoolArray, scales: FloatArray
         at_rest_px2 = np.median(0.5 * np.trace(leds.cov_px2[still], axis1=1, axis2=2))
         more_px2 = max(scales[1] ** 2 - scales[0] ** 2, 0.0) * at_rest_px2
         cov_px2[~still] += more_px2 * np.eye(2)
-    return np.asarray(cov_px2)
+    return np.asarray(pictures_alike[still.astype(np.int64)][:, None, None] * cov_px2)
 
 
 def centroid_scales(chi2: FloatArray, still: BoolArray, use: BoolArray, scale: FloatArray) -> FloatArray:
@@ -77,6 +84,46 @@ def centroid_scales(chi2: FloatArray, still: BoolArray, use: BoolArray, scale: F
     if not enough[1]:
         out[1] = out[0]
     return out
+
+
+def pictures_alike(residual_px: FloatArray, leds: SeenLeds, still: BoolArray, use: BoolArray) -> FloatArray:
+    """Return in how many pictures in a row the error of a centroid is one, shape (2,): moving, and still.
+
+    What lies behind an LED, or on the lens, draws its centroid by an error that changes as the LED moves on
+    by a part of its width, which in a slow motion takes many frames. To the smoother noise is new in each, so
+    it is to believe n frames no more than their mean is known: with noise alike by r_k in frames k apart its
+    variance is ``1 + 2 (r_1 + r_2 + ...)`` times that over n. ``residual_px``, shape (m, 2), are of LEDs by a
+    smoothed motion.
+    """
+    n_frames, n_leds = int(leds.frame.max(initial=-1)) + 1, int(leds.led.max(initial=-1)) + 1
+    out = np.ones(2)
+    for i, of in enumerate((~still, still)):
+        some = use & of
+        if np.count_nonzero(some) >= _MIN_SIGHTINGS:
+            at = leds.frame[some], leds.led[some]
+            seen, off_px = np.zeros((n_frames, n_leds)), np.zeros((n_frames, n_leds, 2))
+            seen[at], off_px[at] = 1.0, residual_px[some]
+            out[i] = _frames_alike(off_px, seen)
+    out[1] = out.max()  # an error that changes with the place in the picture does not while it stands
+    return out
+
+
+def _frames_alike(off_px: FloatArray, seen: FloatArray) -> float:
+    """Return in how many frames in a row errors, shape (n, L, 2), are one; ``seen``, (n, L), is 1 or 0."""
+    mean_px = off_px.sum(axis=0) / np.maximum(seen.sum(axis=0), 1.0)[:, None]
+    off_px = seen[..., None] * (off_px - mean_px)
+    limit_px = _ODD_SDS * np.sqrt(np.square(off_px).sum() / (2 * seen.sum()))
+    off_px = np.clip(off_px, -limit_px, limit_px)
+    variance_px2, alike = float(np.square(off_px).sum() / seen.sum()), 1.0
+    for lag in range(1, min(_MOST_LAG, len(seen) - 1) + 1):
+        n_pairs = float((seen[lag:] * seen[:-lag]).sum())
+        if n_pairs < _MIN_SIGHTINGS:
+            break
+        share = float((off_px[lag:] * off_px[:-lag]).sum()) / (n_pairs * variance_px2)
+        if share < _LEAST_ALIKE:
+            break
+        alike += 2 * share
+    return alike
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,12 @@ from bricktrack_host.fusion.led_by_led.led_measurements import (
     picture,
 )
 from bricktrack_host.fusion.led_by_led.led_noise import (
+    ALL_NEW,
     STATED_SCALES,
     believed_covariance_px2,
     centroid_scales,
     choose_inertial_noise,
+    pictures_alike,
     still_sightings,
 )
 from bricktrack_host.fusion.led_by_led.standing_errors import (
@@ -97,6 +99,7 @@ class _Belief:
 
     run: Run
     scales: FloatArray
+    pictures_alike: FloatArray
     levels: tuple[NoiseLevel, NoiseLevel]
     settings: FusionSettings
     errors: StandingErrors
@@ -174,7 +177,7 @@ class LedSmoother:
         self._use = np.ones(len(self._sights.leds.t_ns), dtype=np.bool_)
         self._n_views = views_told(self._sights.pictured)
         errors = StandingErrors.before(first.run, lever_arm_m, self._n_leds, n_views=self._n_views)
-        self._belief = _Belief(first.run, STATED_SCALES, first.levels, settings, errors)
+        self._belief = _Belief(first.run, STATED_SCALES, ALL_NEW, first.levels, settings, errors)
         self._of_poses = first.used, first.scale, first.chi2
         self._go_on_from(first)
 
@@ -194,7 +197,7 @@ class LedSmoother:
             stands = may_stand and _moved_sds(self._origin_m, done.states) < _STANDS_SDS
             if stands or i == _MOST_PASSES:
                 return self._with_doubt(done, way.doubt(errors, done.states.estimate.of), errors)
-            self._learn(done, errors)
+            self._learn(done, errors, knows_errors=i >= _NOISE_CHOSEN_IN)
             i += 1
             del ready, done, way
 
@@ -203,20 +206,24 @@ class LedSmoother:
         states = replace(done.states, estimate=doubt.added_to(done.states.estimate, 0), doubt=doubt)
         return SmoothedLeds(self._sights.leds, states, done.chi2, done.use, self._belief.scales, errors)
 
-    def _learn(self, done: _Pass, errors: StandingErrors) -> None:
-        """Take from a pass what is believed, and where to linearise, in the next one."""
-        belief, still = self._belief, self._sights.still
-        scales = centroid_scales(done.chi2, still, done.use, belief.scales)
+    def _learn(self, done: _Pass, errors: StandingErrors, *, knows_errors: bool) -> None:
+        """Take from a pass what is believed, and where to linearise, in the next one.
+
+        ``knows_errors``: whether the errors that stand still had been taken out of what it was shown.
+        """
+        belief, still, leds = self._belief, self._sights.still, self._sights.leds
+        of_one = done.chi2 * belief.pictures_alike[still.astype(np.int64)]
+        scales = centroid_scales(of_one, still, done.use, belief.scales)
         more = (scales / belief.scales)[still.astype(np.int64)]
         # An LED that stands beside its place is no outlier in any frame: by how much is estimated.
         estimate = done.states.estimate
-        beside_px = _stands_beside_px(estimate.led_residual_px, self._sights.leds.led, self._n_leds)
+        beside_px = _stands_beside_px(estimate.led_residual_px, leds.led, self._n_leds)
         chi2 = np.fmin(done.chi2, led_chi2(done.states.problem, estimate, beside_px=beside_px))
         self._use = (chi2 < _GATE_CHI2 * np.maximum(more, 1.0) ** 2) & done.pictured.is_facing
         run = belief.run.with_sensor(errors.of_sensor(since=belief.errors))
-        self._belief = replace(belief, run=run, scales=scales, errors=errors)
+        alike = pictures_alike(estimate.led_residual_px, leds, still, done.use) if knows_errors else ALL_NEW
+        self._belief = replace(belief, run=run, scales=scales, pictures_alike=alike, errors=errors)
         if not done.holds():
-            leds = self._sights.leds
             del self._sights
             self._sights, placed = _sights(leds, done.states, *self._models)
             self._use = self._use[placed]
@@ -312,7 +319,8 @@ def _prepared(
     P_start[:, :_START, :_START] *= _START_SHARE**2
     arrays, of_leds = led_arrays(
         leds, pictured, run, nodes, lin, belief.levels,
-        cov_px2=believed_covariance_px2(leds, sights.still, belief.scales), use=use, settings=settings,
+        cov_px2=believed_covariance_px2(leds, sights.still, belief.scales, belief.pictures_alike),
+        use=use, settings=settings,
     )  # fmt: skip
     problem = replace(problem, leds=arrays, P_start=P_start)
     return _Ready(pictured, use, run, nodes, lin, problem), of_steps, of_leds
