@@ -18,7 +18,8 @@ class LedFlag(IntFlag):
     BLURRED = 16
     """Moved by more than its radius during the exposure: used with a wider covariance."""
     OUTLIER = 32
-    """Its residual is beyond what its covariance allows: weighted down or left out."""
+    """Elsewhere than all the others say: left out of the fused motion in this frame; or, where so in all
+    frames alike, doubted by as much."""
     UNCOVERED = 64
     """Its ray lies where no calibration dot was: the ray model extrapolates."""
 

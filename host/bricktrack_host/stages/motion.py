@@ -18,7 +18,7 @@ from bricktrack_host.fusion.optical.optical_smoothing import smooth_optical
 from bricktrack_host.fusion.pose_by_pose.fused_output import unsure_times
 from bricktrack_host.fusion.sensor_agreement import doubt_about_camera_sensor
 from bricktrack_host.fusion.tight import TightResult, fuse_tight
-from bricktrack_host.quality import PoseFlag
+from bricktrack_host.quality import LedFlag, PoseFlag
 from bricktrack_host.results.daq_clock import EdgeFit
 from bricktrack_host.results.ray_errors import RayErrors
 from bricktrack_host.results.result_tables import FusedKind
@@ -182,10 +182,19 @@ def fuse_run(
     problems: list[str],
     *,
     seen: tuple[LedObservations, RayModel] | None,
-) -> tuple[dict[FusedKind, FusedTrack], FusionResult | None]:
-    """Return the motion at the instants wanted: LED by LED where ``seen`` is given, else pose by pose."""
+) -> tuple[dict[FusedKind, FusedTrack], FusionResult | None, BoolArray | None]:
+    """Return the motion at the instants wanted: LED by LED where ``seen`` is given, else pose by pose.
+
+    Returns
+    -------
+    parts : dict of FusedTrack
+    fusion : FusionResult or None
+        `None` where the motion is of the optical poses alone.
+    rejected : ndarray of bool, shape (n_frames, n_leds), or None
+        Centroids that the motion leaves out; `None` where it is not LED by LED.
+    """
     wanted = np.concatenate(list(grid.t_ns.values()))
-    fusion, by_poses = None, None
+    fusion, by_poses, rejected = None, None, None
     if inertial is not None and not inertial.is_hint and brick.imu_lever_arm_mm is not None:
         lever_arm_mm = brick.imu_lever_arm_mm
         try:
@@ -195,7 +204,7 @@ def fuse_run(
                 tight = _fuse_tight(
                     optical, inertial, brick, seen, wanted, problems, lever_arm_mm=lever_arm_mm
                 )
-                fusion, by_poses = tight.fused, tight.pose_level
+                fusion, by_poses, rejected = tight.fused, tight.pose_level, tight.led_rejected
         except (ShapeError, TrackingError) as e:
             problems.append(f"fusion was not possible, optical poses alone: {e}")
     if fusion is not None:
@@ -216,7 +225,15 @@ def fuse_run(
         kind: rows_of(track, slice(end - len(t), end))
         for (kind, t), end in zip(grid.t_ns.items(), ends.tolist(), strict=True)
     }
-    return parts, fusion
+    return parts, fusion, rejected
+
+
+def with_rejected_told(observations: LedObservations, rejected: BoolArray | None) -> LedObservations:
+    """Return centroids in which those that the motion leaves out, (n_frames, n_leds), are outliers."""
+    if rejected is None:
+        return observations
+    flags = np.where(rejected, int(LedFlag.OUTLIER), 0)
+    return replace(observations, led_flags=observations.led_flags | flags)
 
 
 def _fuse_tight(

@@ -32,6 +32,7 @@ from bricktrack_host.stages.motion import (
     output_grid,
     retime,
     with_ray_errors,
+    with_rejected_told,
     with_restamped_told,
     with_times_doubted,
     with_unsure_times,
@@ -123,7 +124,8 @@ def solve_run(
         problems += words_on_knocks(optical, inertial)
         grid = output_grid(optical, inertial, edge_fit)
         seen = (with_times_doubted(observations, time_sd_ns), rays) if settings.rolling_shutter else None
-        fused, fusion = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
+        fused, fusion, rejected = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
+        observations = with_rejected_told(observations, rejected)
         optical, fused = with_unsure_times(optical, fused, time_sd_ns)
         fused = with_restamped_told(optical, fused)
         errors_of_rays = ray_errors(

@@ -6,11 +6,14 @@ import numpy as np
 from daemon_runs import simulate_run
 from scipy.spatial.transform import Rotation
 
+from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.pose_by_pose.moving_camera import align_both
+from bricktrack_host.quality import LedFlag
 from bricktrack_host.stages.clocks import Inertial
 from bricktrack_host.stages.motion import (
     OutputGrid,
     fuse_run,
+    with_rejected_told,
     with_times_doubted,
     words_on_led_offsets,
     words_on_rejected,
@@ -51,6 +54,24 @@ def test_a_centroid_left_out_now_and_then_is_no_point_to_read():
     rejected.ravel()[2:4] = True
     assert "4 of 240 LED centroids (1.7 %)" in words_on_rejected(rejected, fused)[0]
     assert words_on_rejected(rejected[:0], fused[:0]) == []
+
+
+def test_the_table_of_flags_counts_the_centroids_that_the_problems_say_were_left_out():
+    run = simulate_run(11, duration_s=4.0, amplitude_mm=5.0)
+    optical = solve_poses(run.observations, run.camera, run.brick)
+    uv = run.observations.uv_px.copy()
+    uv[10:70:4, 2] += 6.0  # glints: LEDs that the poses' start had right
+    observations, problems = replace(run.observations, uv_px=uv), []
+    *_, rejected = fuse_run(
+        optical, Inertial(run.imu, align_times(optical, run.imu)), run.brick,
+        OutputGrid({"frame": optical.t_ns}, np.empty(0, dtype=np.int64)), problems,
+        seen=(observations, run.camera),
+    )  # fmt: skip
+    told = with_rejected_told(observations, rejected)
+    n = np.count_nonzero(told.led_flags & LedFlag.OUTLIER)
+    assert n >= 14 and any(f"{n} of " in words and "left out" in words for words in problems)
+    assert ((told.led_flags ^ observations.led_flags) == np.where(rejected, LedFlag.OUTLIER, 0)).all()
+    assert with_rejected_told(observations, None) is observations
 
 
 def test_leds_beside_their_places_are_told_beyond_what_is_usual():
