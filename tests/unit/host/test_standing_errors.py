@@ -7,15 +7,18 @@ import pytest
 from daemon_runs import simulate_run
 
 from bricktrack_common.brick_model import ProfileEntry
+from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.estimate import FusionInput, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led import led_smoothing, standing_errors
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_smoothing import LedSmoother
 from bricktrack_host.fusion.led_by_led.standing_errors import StandingPrior, StandingWay, _likeliest
+from bricktrack_host.fusion.pose_by_pose.fused_output import sample_poses
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
 from bricktrack_host.fusion.smoothing.smoother import POS, Filter
-from bricktrack_host.tracking.optical_track import solve_poses
+from bricktrack_host.tracking.led_model.led_profile import collar_of, predict_brick
+from bricktrack_host.tracking.optical_track import led_times_ns, solve_poses
 
 SETTINGS = FusionSettings()
 PROFILE, SPREAD, SMEAR, FIRST_LED, BY_VIEW = 21, 23, 24, 30, 44
@@ -232,3 +235,26 @@ def test_three_sharp_leds_at_the_start_leave_no_variance_to_rounding():
     done = smoothed(replace(run, observations=replace(run.observations, uv_px=uv)))
     assert np.all(done.states.estimate.variance[:, 0] > 0)
     assert done.states.problem.leds.inflation.max() < 5
+
+
+def with_darker_limb(run):
+    """Return a run whose lights lean forward by up to 0.08 of radius times sine, the more from in front."""
+    _, t_ns = led_times_ns(run.observations, run.camera)
+    R, t_mm = (x.reshape(*t_ns.shape, *x.shape[1:]) for x in run.world.pose(t_ns.ravel()))
+    there, _ = predict_brick(R, t_mm, run.camera, run.brick, collar_mm=collar_of(run.brick))
+    side_on_px = there.model_shift_px / run.brick.led_profile.shift_sd_per_radius
+    angle_rad = np.arccos(np.clip(there.facing, -1, 1))
+    shift_px = (0.08 * np.clip(1 - angle_rad / 0.5, 0, 1))[..., None] * side_on_px
+    observations = replace(run.observations, uv_px=run.observations.uv_px + shift_px)
+    return replace(run, observations=observations)
+
+
+def test_a_shape_that_shows_from_in_front_alone_turns_no_pose():
+    # One LED of the seven looks into the camera, and stands out of the others' plane.
+    run = simulate_run(31, duration_s=4.0)
+    now = smoothed(with_darker_limb(run)).states
+    t_ns = run.observations.sensor_timestamp_ns[10:-10]
+    R, _ = sample_poses(now.run, now.nodes, now.estimate.state, 0, t_ns)
+    turn_deg = np.degrees(rvec_from_matrix(np.swapaxes(run.truth(t_ns)[0], 1, 2) @ R))
+    # 0.058 where it was believed of each LED by itself, 0.008 where there is no such shape.
+    assert np.sqrt(np.mean(np.sum(turn_deg**2, axis=1))) < 0.02
