@@ -2,7 +2,7 @@
 
 The recordings are those of ``broad_windows.py`` (BROAD, CC BY 4.0; simulated camera noise and sensor).
 
-Run: ``python scripts/bench_fusion.py --seeds 3``; with ``--gtsam``, batch
+Run: ``python scripts/bench_fusion.py --seeds 3``, a second a case; with ``--gtsam``, batch
 optimisation by GTSAM stands beside (half a minute a case; ``pip install gtsam``).
 """
 
@@ -12,10 +12,11 @@ import itertools
 import logging
 import os
 import resource
+import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before NumPy is loaded
 
@@ -88,7 +89,7 @@ def run_case(case: Case, *, with_gtsam: bool = False) -> tuple[dict[str, Score],
     started = time.perf_counter()
     alignment = align_times(case.optical, case.imu, max_offset_s=0.25)
     settings = FusionSettings()
-    item = FusionInput(case.optical, case.imu, LEVER_ARM_MM, case.t_out_ns, alignment)
+    item = replace(_input(case), alignment=alignment)
     smoothed = smooth_poses([prepare_run(item, settings)], settings)[0]
     result = fused_result(item, smoothed, settings, with_forward=True)
     seconds = time.perf_counter() - started
@@ -146,13 +147,20 @@ def _rms(values: Sequence[float] | FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+def _input(case: Case) -> FusionInput:
+    return FusionInput(case.optical, case.imu, LEVER_ARM_MM, case.t_out_ns)
+
+
+def warm_up(case: Case) -> None:
+    """Fuse once, untimed: compiled code is loaded, and on a new machine made, which takes a minute."""
+    print("loading compiled code, or compiling it", file=sys.stderr, flush=True)
+    fuse_batch([_input(case)])
+
+
 def time_batch(cases: list[Case], *, runs: int, workers: int) -> tuple[float, float, float]:
     """Return wall time and processor time of aligning and fusing so many runs, s, and a worker's peak, MB."""
-    inputs = [
-        FusionInput(c.optical, c.imu, LEVER_ARM_MM, c.t_out_ns)
-        for c, _ in zip(itertools.cycle(cases), range(runs), strict=False)
-    ]
-    fuse_batch(inputs[:1])  # compiled code is loaded, and made on a new machine
+    inputs = [_input(c) for c, _ in zip(itertools.cycle(cases), range(runs), strict=False)]
+    warm_up(cases[0])
     started = time.perf_counter()
     with ProcessPoolExecutor(workers) as pool:
         results = fuse_batch(inputs, executor=pool)
@@ -208,8 +216,10 @@ def main() -> None:
         table.add_column(column, justify="left" if column in ("window", "method") else "right")
     all_scores: dict[str, list[Score]] = {}
     all_facts: dict[str, list[float]] = {}
+    warm_up(make_case(paths[0], seed=args.first_seed, recipe=recipe))
     for path in paths:
         for seed in range(args.first_seed, args.first_seed + args.seeds):
+            print(f"{path.stem}, seed {seed}", file=sys.stderr, flush=True)
             scores, facts = run_case(make_case(path, seed=seed, recipe=recipe), with_gtsam=args.gtsam)
             for method, s in scores.items():
                 all_scores.setdefault(method, []).append(s)
