@@ -301,7 +301,6 @@ class RunCycle:
                 seconds = (monotonic_ns() - (self.session.t0_ns or 0)) / 1e9
                 self._finish(interrupted=f"the daemon was stopped {seconds:.1f} s after t = 0")
             elif self.state == "armed":
-                self._order.forget()
                 self._close_session()
                 self._change("stop")
             elif self._kept.run_id:
@@ -309,6 +308,7 @@ class RunCycle:
         except Exception:
             logger.exception("a bug in the recorder while it ends")
         finally:
+            self._order.forget()
             self._close_session()
             self._light.put_out()
         if self._kept.run_id:

@@ -109,19 +109,22 @@ def test_a_unit_that_arms_itself_leaves_an_armed_state_that_lost_its_camera(
 
 
 def test_a_unit_that_arms_itself_again_does_so_for_the_hosts_order(
-    bench: MakeBench, monkeypatch: pytest.MonkeyPatch
+    bench: MakeBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_cycle, "_RETRY_S", 0.05)
     monkeypatch.setattr(lost_sensors, "PATIENCE_S", 0.2)
     camera = FakeCamera()
     recording = RecordingTable(duration_s=0.5, pre_roll_s=0.2, post_roll_s=0.1, auto_arm=True, label="own")
-    b = bench(rig=FakeRig(camera=camera), recording=recording)
+    storage = StorageTable(folder=str(tmp_path), margin_mb=1, black_box=str(tmp_path / "box"))
+    order = tmp_path / "box" / ".armed-unit-1.json"
+    b = bench(rig=FakeRig(camera=camera), recording=recording, storage=storage)
     b.wait_for("armed")
     assert isinstance(b.ask("disarm"), Disarmed)
     first = b.arm("impact", 0.3).run_id
     camera.silent_after = 1
     b.wait_for("fault")
     assert "will arm itself again" in b.recorder.status().reason
+    assert order.exists()  # the daemon may be killed meanwhile
     camera.silent_after = None
     b.wait_for("armed")
     second = b.recorder.status().run_id
@@ -132,8 +135,15 @@ def test_a_unit_that_arms_itself_again_does_so_for_the_hosts_order(
     assert m.trigger.t0_ns is not None and m.window_ns is not None
     assert m.window_ns[1] - m.trigger.t0_ns == 400_000_000  # the host's 0.3 s and 0.1 s after it
     assert any("edges in between were not heard" in words for words in m.missing)
+    assert not order.exists()
     b.wait_for("armed")  # the order is carried out: the next run is the unit's own
     assert b.recorder.status().run_id.endswith("_own") and "again" not in b.recorder.status().reason
+    assert isinstance(b.ask("disarm"), Disarmed)
+    b.arm("impact", 0.3)
+    camera.silent_after = 1
+    b.wait_for("fault")
+    b.recorder.stop()
+    assert not order.exists()  # it was ended on purpose
 
 
 def test_a_unit_whose_only_sensor_hangs_is_in_fault_after_as_long_as_one_without_pictures(
