@@ -211,10 +211,8 @@ def test_a_daemon_that_was_killed_while_armed_arms_before_it_tries_its_sensors(
         assert unit.status().run_id.endswith("_impact") and tried == []
     with closing(Unit(tmp_path / "card")) as unit:  # it was ended on purpose
         assert unit.status().state == "idle" and len(tried) == 1
-    week_ns = 7 * 86_400 * 10**9
-    order.note(
-        ArmOrder(label="old", duration_s=None, t_ns=monotonic_ns() - week_ns), "unit-1_000000_0002_old"
-    )
+    last_week = ArmOrder(label="old", duration_s=None, t_ns=monotonic_ns() - 7 * 86_400 * 10**9)
+    order.note(last_week, "unit-1_000000_0002_old")
     with closing(Unit(tmp_path / "card")) as unit:
         unit.wait(lambda: "'old', and is not armed again" in unit.status().last_error)
         assert unit.status().state == "idle" and len(tried) == 2
