@@ -118,7 +118,8 @@ def test_what_acceleration_draws_centroids_by_is_not_told_but_makes_all_unsure(p
     scale = np.sqrt(np.diagonal(unsure.covariance)) + 1e-12
     off = (more - 0.4**2 * np.outer(wrong, wrong)) / np.outer(scale, scale)
     assert np.abs(off).max() < 0.01  # each LED moves the state at which the next is linearised
-    assert np.max(np.abs(wrong[:21]) * 0.4 / scale[:21]) > 0.05  # the accelerometer's scale, for one
+    # What low-passes take has the same shape: most of it goes to the gyro's.
+    assert abs(wrong[-1]) * 0.4 / scale[-1] > 0.05
 
 
 def test_three_leds_at_once_do_not_tell_how_far_single_ones_are_off(plain):
@@ -258,3 +259,15 @@ def test_a_shape_that_shows_from_in_front_alone_turns_no_pose():
     turn_deg = np.degrees(rvec_from_matrix(np.swapaxes(run.truth(t_ns)[0], 1, 2) @ R))
     # 0.058 where it was believed of each LED by itself, 0.008 where there is no such shape.
     assert np.sqrt(np.mean(np.sum(turn_deg**2, axis=1))) < 0.02
+
+
+def test_what_the_gyros_low_pass_takes_is_found():
+    # The simulated chip's is critically damped, with a delay of 7 ms. Poses alone put it at 2.7 to 3.5 ms / 2.
+    run = simulate_run(13, duration_s=16.0)
+    done = smoothed(run)
+    loss_s2 = done.states.run.alignment.gyro_filter_s**2 + done.errors.value[-1]
+    sd_s2 = np.sqrt(done.errors.covariance[-1, -1])
+    assert sd_s2 < 1e-6
+    assert abs(loss_s2 - 3.5e-3**2) < 3 * sd_s2
+    arm_sds = done.errors.value[18:21] / np.sqrt(np.diagonal(done.errors.covariance))[18:21]
+    assert np.abs(arm_sds).max() < 3.5

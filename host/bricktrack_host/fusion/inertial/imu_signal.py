@@ -106,6 +106,10 @@ class ImuSignal:
         """Return the signals with this low-pass of the accelerometer undone, in place of any other."""
         return replace(self, _acc=self._acc_as_read.sharpened(acc_filter_s))
 
+    def with_gyro_filter(self, gyro_filter_s: float) -> "ImuSignal":
+        """Return the signals with this low-pass of the gyro undone, in place of nearly the same one."""
+        return replace(self, _gyro=self._gyro_as_read.sharpened(gyro_filter_s, like=self._gyro))
+
     def without_gains(self, gyro_gain: FloatArray, acc_gain: FloatArray) -> "ImuSignal":
         """Return the signals with these gains of the samples taken out, shape (3, 3), in place of any others.
 

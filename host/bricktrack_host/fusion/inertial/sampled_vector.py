@@ -67,6 +67,8 @@ class SampledVector:
         matrix is what it is turned by. None: it was sampled itself.
     turned_from : SampledVector or None
         That which was turned; next to equal, it is as rough.
+    like : SampledVector or None
+        Another that is next to equal.
     """
 
     t_s: FloatArray
@@ -75,10 +77,20 @@ class SampledVector:
     fill: tuple[FloatArray, FloatArray] | None
     parts: tuple[tuple[FloatArray, "SampledVector"], ...] = ()
     turned_from: "SampledVector | None" = None
+    like: "SampledVector | None" = None
+
+    @property
+    def first_alike(self) -> "SampledVector":
+        """Return the first of those that are next to equal to each other."""
+        return self if self._alike is None else self._alike.first_alike
+
+    @property
+    def _alike(self) -> "SampledVector | None":
+        return self.turned_from if self.like is None else self.like
 
     @cached_property
     def _roughness(self) -> tuple[FloatArray, FloatArray]:
-        return roughness(self.values) if self.turned_from is None else self.turned_from._roughness
+        return roughness(self.values) if self._alike is None else self._alike._roughness
 
     @property
     def steady(self) -> FloatArray:
@@ -88,8 +100,8 @@ class SampledVector:
     @cached_property
     def impacts(self) -> FloatArray:
         """Return the pulses, shape (n,), see `roughness`; across a gap the spline stands for neighbours."""
-        if self.turned_from is not None:
-            return self.turned_from.impacts
+        if self._alike is not None:
+            return self._alike.impacts
         t_s = self.t_s
         missing = np.flatnonzero(np.diff(t_s) > GAP_PERIODS * self.period_s)
         if not missing.size:
@@ -102,13 +114,13 @@ class SampledVector:
     @cached_property
     def bridge_error(self) -> FloatArray:
         """Return the error of the cubic where one sample is missing, shape (n,)."""
-        return bridge_error(self.values) if self.turned_from is None else self.turned_from.bridge_error
+        return bridge_error(self.values) if self._alike is None else self._alike.bridge_error
 
     @cached_property
     def slow(self) -> FloatArray:
         """Return the samples without what is faster than bricks move, shape (n, 3)."""
-        if self.turned_from is not None:
-            return self.turned_from.slow
+        if self._alike is not None:
+            return self._alike.slow
         side = len(_SMOOTH) // 2
         padded = np.pad(self.values, ((side, side), (0, 0)), mode="edge")
         return np.stack([np.convolve(axis, _SMOOTH, "valid") for axis in padded.T], axis=1)
@@ -116,15 +128,15 @@ class SampledVector:
     @cached_property
     def slow_change(self) -> FloatArray:
         """Return how fast the slow part changes, shape (n,)."""
-        if self.turned_from is not None:
-            return self.turned_from.slow_change
+        if self._alike is not None:
+            return self._alike.slow_change
         return np.asarray(np.linalg.norm(np.gradient(self.slow, self.t_s, axis=0), axis=1))
 
     @cached_property
     def slow_aside(self) -> FloatArray:
         """Return how far the slow part lies from its median, shape (n,)."""
-        if self.turned_from is not None:
-            return self.turned_from.slow_aside
+        if self._alike is not None:
+            return self._alike.slow_aside
         return np.asarray(np.linalg.norm(self.slow - np.median(self.slow, axis=0), axis=1))
 
     @cached_property
@@ -173,21 +185,21 @@ class SampledVector:
         parts = tuple((turn @ own, part) for own, part in self.parts) or ((turn, self),)
         return replace(self, values=self.values @ turn.T, fill=fill, parts=parts, turned_from=self)
 
-    def sharpened(self, filter_s: float) -> "SampledVector":
+    def sharpened(self, filter_s: float, *, like: "SampledVector | None" = None) -> "SampledVector":
         """Return the vector with the amplitudes that a low-pass took from it, at the times where it put them.
 
         The low-pass is of second order and critically damped, ``1 / (1 + s filter_s)^2``: mean delay
         ``2 filter_s``, -3 dB at ``0.102 / filter_s`` Hz. Without its delay its inverse is
         ``1 - u^2 + 2/3 u^3 + O(u^5)`` with ``u = s filter_s``, whose derivatives are those of five points.
-        Nothing is done at zero.
+        Nothing is done at zero. ``like``: the same by nearly the same low-pass.
         """
         if filter_s <= 0:
             return self
         if self.turned_from is not None:
-            return self.turned_from.sharpened(filter_s).turned(self.parts[0][0])
+            return self.turned_from.sharpened(filter_s, like=like).turned(self.parts[0][0])
         second, third = self._second_and_third
         of_second, of_third = -(filter_s**2), 2 / 3 * filter_s**3
         values = self.values + of_second * second.values + of_third * third.values
         eye = np.eye(3)
         parts = (eye, self), (of_second * eye, second), (of_third * eye, third)
-        return replace(self, values=values, parts=parts)
+        return replace(self, values=values, parts=parts, like=None if like is None else like.first_alike)

@@ -57,6 +57,10 @@ _OFFSET_SDS_PX = np.geomspace(0.005, 1.0, 30)
 _CHANGE_SDS_PX = np.geomspace(0.005, 1.0, 10)
 """That they may change by within `_ALIKE_RAD`. It goes its own way: a misplaced LED's error hardly changes,
 what lens, light and coding do to an LED is another error some pixels further on."""
+_GYRO_LOSS_SD_S2 = 5e-6
+"""Of what the gyro's low-pass takes from its second derivative, beside what the alignment finds: a critically
+damped one of 32 Hz takes 1.2e-5, one that is flat to second order nothing, and poses alone hardly tell. Left
+alone it was taken for a gyro's scale, a lever arm and LEDs beside their places in 300 s (simulated)."""
 _HIDDEN_SHARE = np.sqrt(2)
 """Of single LEDs' errors, what is believed over what they show among themselves. To the pictures that show it
 the shape of the LEDs was fitted, and often their places: what looks like a pose was left. Recordings by
@@ -65,13 +69,14 @@ another renderer than this project's had 1.4 times as much on the median (simula
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandingErrors:
-    """Errors that stand still, in one vector of q = 30 + 2 V L, or 53 + 2 V L where the camera moves.
+    """Errors that stand still, in one vector of q = 31 + 2 V L, or 54 + 2 V L where the camera moves.
 
     In this order: gyro and accelerometer, row by row, and lever arm, m, as in `sensor_errors.SensorErrors`;
     the profile's, in units of its stated sd; the picture's size over what it should be, less 1; how far
     acceleration draws the centroid, likewise, which is not estimated and stays 0; how far the smear draws it,
     over the smear; what the shape shows at other angles, in units of `shape_shifts_px`; (u, v) of each of L
-    LEDs, px, and V - 1 times as many that change with the view, see `_by_view`; those of the sensor that
+    LEDs, px, and V - 1 times as many that change with the view, see `_by_view`; what the gyro's
+    low-pass takes from the second derivative, s^2, over what the alignment says; those of the sensor that
     moves with the camera, as in `CameraErrors.values`.
 
     Attributes
@@ -98,17 +103,22 @@ class StandingErrors:
         gains = [(gain - np.eye(3)).ravel() for gain in (run.gyro_gain, run.acc_gain)]
         theirs = np.zeros(0) if run.camera is None else run.camera.errors.values()
         of_pictures = np.zeros(_FIRST_LED - N_ERRORS + 2 * n_views * n_leds)
-        value = np.concatenate([*gains, run.lever_arm_m - lever_arm_m, of_pictures, theirs])
+        value = np.concatenate(
+            [*gains, run.lever_arm_m - lever_arm_m, of_pictures, [run.gyro_loss_s2], theirs]
+        )
         return cls(value, np.zeros((len(value), len(value))), 0.0, n_leds, n_views)
 
     def of_sensor(self, *, since: "StandingErrors") -> SensorErrors:
         """Return what the inertial sensor's errors have changed by."""
         change = self.value - since.value
         gyro, acc = change[:N_GAINS].reshape(2, 3, 3)
-        theirs = _FIRST_LED + 2 * self.n_views * self.n_leds
+        loss = _FIRST_LED + 2 * self.n_views * self.n_leds
+        theirs = loss + 1
         at = np.append(np.arange(N_ERRORS), np.arange(theirs, len(change)))
         camera = CameraErrors.of(change[theirs:]) if theirs < len(change) else None
-        return SensorErrors(gyro, acc, change[ARM], self.covariance[np.ix_(at, at)], camera)
+        return SensorErrors(
+            gyro, acc, change[ARM], self.covariance[np.ix_(at, at)], camera, gyro_loss_s2=float(change[loss])
+        )
 
     def in_picture_px(self, leds: SeenLeds, pictured: Pictured) -> FloatArray:
         """Return by how much the centroids are off for them, shape (m, 2)."""
@@ -164,12 +174,18 @@ class StandingPrior:
         own = OWN_SHARE * self.led_shift_px
         last_led = _FIRST_LED + own.size
         by_view = slice(last_led, _FIRST_LED + self.n_views * own.size)
-        q = by_view.stop + len(self.camera_sd)
+        q = by_view.stop + 1 + len(self.camera_sd)
         out = np.zeros((*np.broadcast_shapes(np.shape(offset_sd_px), np.shape(change_sd_px)), q, q))
         at = np.arange(q)
         of_all = [1.0, _SCALE_SD**2, 0.0, _SMEAR_SD**2, *np.ones(N_SHAPES)]
         out[..., at, at] = np.concatenate(
-            [self.sensor_sd**2, of_all, np.zeros(self.n_views * own.size), self.camera_sd**2]
+            [
+                self.sensor_sd**2,
+                of_all,
+                np.zeros(self.n_views * own.size),
+                [_GYRO_LOSS_SD_S2**2],
+                self.camera_sd**2,
+            ]
         )
         for led, shift in enumerate(own):
             part = slice(_FIRST_LED + 2 * led, _FIRST_LED + 2 * led + 2)
@@ -212,12 +228,13 @@ class StandingWay:
         of_all = _of_all_leds(pictured)
         views = _by_view(pictured, n_views)
         self._among_themselves = AmongThemselves.of(arrays, leds, of_all, views, n_leds)
-        camera, last = None, np.zeros((len(of_all), 2, 0))
+        camera, last = None, np.zeros((len(of_all), 2, 1))
         if R_still_camera is not None:
             camera = CameraWay.of(problem, R_still_camera, 0)
             node = np.repeat(np.arange(len(problem.has_frame)), np.diff(arrays.first[:, 0]))
             t_s = camera.t_s[node] + arrays.dt_s
-            last = arrays.J @ camera.of_seen(arrays.R_lin, arrays.t_lin_m, t_s)
+            moved = arrays.J @ camera.of_seen(arrays.R_lin, arrays.t_lin_m, t_s)
+            last = np.concatenate([last, moved], axis=2)
         sight = Sight(
             first=np.ascontiguousarray(arrays.first[:, 0]),
             use=arrays.use,
@@ -227,7 +244,7 @@ class StandingWay:
             n_leds=n_leds,
             last=last,
         )
-        self._way = ErrorWay.of(passed, 0, sight, camera)
+        self._way = ErrorWay.of(passed, 0, sight, camera, turning=_turned_by_loss(problem))
 
     def estimate(self, prior: StandingPrior, known: FloatArray) -> StandingErrors:
         """Return the likeliest errors and their covariance, where ``known``, shape (q,), was taken out.
@@ -264,6 +281,12 @@ def views_told(pictured: Pictured) -> int:
     """Return how many of `_by_view` tell: where LEDs are seen from nearly one side, their squares do not."""
     curved = np.square(pictured.from_side_rad / _ALIKE_RAD).sum(axis=1) / np.sqrt(2)
     return N_VIEWS if curved.max(initial=0.0) > _CURVED_TELLS else _N_LINEAR
+
+
+def _turned_by_loss(problem: Problem) -> FloatArray:
+    """Return by how much a gyro turns each step less for each s^2 of loss, shape (K - 1, 3, 1), rad/s^2."""
+    t_s = np.concatenate([[0.0], np.cumsum(problem.dt_s[:, 0])])
+    return np.asarray(-np.diff(np.gradient(problem.omega_radps[:, 0], t_s, axis=0), axis=0)[..., None])
 
 
 def _by_view(pictured: Pictured, n_views: int) -> FloatArray:

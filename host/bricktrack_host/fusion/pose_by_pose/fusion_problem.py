@@ -64,6 +64,8 @@ class Run:
         Of the samples over the truth, as far as is known.
     sensor_covariance : ndarray, shape (21, 21) or (44, 44)
         Of what is left in them and in the lever arm, see `sensor_errors.SensorErrors`.
+    gyro_loss_s2 : float
+        What the gyro's low-pass takes from the second derivative, over what the alignment says.
     """
 
     imu: ImuTrack
@@ -83,6 +85,7 @@ class Run:
     gyro_gain: FloatArray = field(default_factory=lambda: np.eye(3))
     acc_gain: FloatArray = field(default_factory=lambda: np.eye(3))
     sensor_covariance: FloatArray = field(default_factory=lambda: np.zeros((21, 21)))
+    gyro_loss_s2: float = 0.0
 
     @classmethod
     def from_tracks(
@@ -152,6 +155,11 @@ class Run:
         """Return the run with the errors of the sensor, and of its place, taken out."""
         gyro_gain = (np.eye(3) + errors.gyro) @ self.gyro_gain
         acc_gain = (np.eye(3) + errors.acc) @ self.acc_gain
+        gyro_loss_s2 = self.gyro_loss_s2 + errors.gyro_loss_s2
+        signal = self.signal.without_gains(gyro_gain, acc_gain)
+        if errors.gyro_loss_s2 != 0.0:
+            loss_s2 = self.alignment.gyro_filter_s**2 + gyro_loss_s2
+            signal = signal.with_gyro_filter(float(np.sqrt(max(loss_s2, 0.0))))
         camera, R_seen, p_seen_m = self.camera, self.R_seen, self.p_seen_m
         if self.camera is not None:
             camera = self.camera.with_acc_loss(0.0)
@@ -160,13 +168,14 @@ class Run:
                 R_seen, p_seen_m = camera.poses_from(self.camera, self.still_s, R_seen, p_seen_m)
         return replace(
             self,
-            signal=self.signal.without_gains(gyro_gain, acc_gain),
+            signal=signal,
             camera=camera,
             R_seen=R_seen,
             p_seen_m=p_seen_m,
             lever_arm_m=self.lever_arm_m + errors.arm_m,
             gyro_gain=gyro_gain,
             acc_gain=acc_gain,
+            gyro_loss_s2=gyro_loss_s2,
             sensor_covariance=errors.covariance,
         )
 

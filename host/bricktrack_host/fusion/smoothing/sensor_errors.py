@@ -42,6 +42,8 @@ class SensorErrors:
         Of gyro and acc, row by row, and arm_m; and of the camera's sensor, see `CameraErrors.values`.
     camera : CameraErrors or None
         Of the sensor that moves with the camera.
+    gyro_loss_s2 : float
+        What the gyro's low-pass takes from the second derivative, over what it was believed to.
     """
 
     gyro: FloatArray
@@ -49,6 +51,7 @@ class SensorErrors:
     arm_m: FloatArray
     covariance: FloatArray
     camera: CameraErrors | None = None
+    gyro_loss_s2: float = 0.0
 
 
 def sensor_prior_sd(settings: FusionSettings) -> FloatArray:

@@ -40,14 +40,32 @@ class ErrorWay:
     pull: FloatArray
 
     @classmethod
-    def of(cls, passed: Filter, b: int, sight: Sight, camera: CameraWay | None) -> "ErrorWay":
-        """Go over run ``b`` of a batch, where the errors change by themselves what ``sight`` says."""
+    def of(
+        cls,
+        passed: Filter,
+        b: int,
+        sight: Sight,
+        camera: CameraWay | None,
+        *,
+        turning: FloatArray | None = None,
+    ) -> "ErrorWay":
+        """Go over run ``b`` of a batch, where the errors change by themselves what ``sight`` says.
+
+        ``turning``, shape (K - 1, 3, d): what the first of its last errors turn in each step, rad.
+        """
         run, kept = passed.runs[b], passed.kept(b)
         n_own = sight.shared.shape[2] + 2 * sight.by_view.shape[1] * sight.n_leds
-        q = N_GAINS + n_own + sight.last.shape[2]
-        further = np.zeros((len(run.dt_s), 3, 0)) if camera is None else np.ascontiguousarray(camera.velocity)
+        n_last = sight.last.shape[2]
+        q = N_GAINS + n_own + n_last
+        further = np.zeros((len(run.dt_s), 3, n_last))
+        if camera is not None:
+            further[..., -N_CAMERA_ERRORS:] = camera.velocity
+        if turning is None:
+            turning = np.zeros((len(run.dt_s), 3, 0))
         now_before = np.empty((len(kept[-1]), N_STATES * q))
-        found = cls(Way(run, *kept, sight, further, now_before), camera, np.empty((q, q)), np.empty(q))
+        found = cls(
+            Way(run, *kept, sight, further, now_before, turning), camera, np.empty((q, q)), np.empty(q)
+        )
         carry_forward(found.way, found.normal, found.pull)
         return found
 

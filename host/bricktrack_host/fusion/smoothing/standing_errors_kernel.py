@@ -71,6 +71,8 @@ class Way(NamedTuple):
         What the last c errors change of the velocity in each step.
     now_before : ndarray, shape (n, 22 q)
         Derivatives of the state before each stretch, written by `carry_forward`.
+    turning : ndarray, shape (K - 1, 3, d), rad
+        What the first d of the last c errors turn in each step.
     """
 
     run: RunArrays
@@ -82,10 +84,11 @@ class Way(NamedTuple):
     sight: Sight
     further: FloatArray
     now_before: FloatArray
+    turning: FloatArray
 
 
 @compiled
-def _drive(run: RunArrays, k: int, R: Any, further: Any, now: Any) -> None:
+def _drive(run: RunArrays, k: int, R: Any, further: Any, turning: Any, now: Any) -> None:
     """Add what the errors do to the state in the step from node ``k``: the gains, and the last c."""
     h, half, dv = run.dt_s[k], run.R_half[k], run.dv_mps[k]
     first = now.shape[1] - further.shape[1]
@@ -102,6 +105,8 @@ def _drive(run: RunArrays, k: int, R: Any, further: Any, now: Any) -> None:
         for c in range(further.shape[1]):
             now[6 + r, first + c] += further[r, c]
             now[3 + r, first + c] += 0.5 * h * further[r, c]
+        for c in range(turning.shape[1]):
+            now[r, first + c] += turning[r, c]
 
 
 @compiled_sums
@@ -173,7 +178,7 @@ def _go_again(way: Way, c: int, of: Any, now: Any, changed: Any) -> tuple[Kept, 
             R_last = kept.R[k - start - 1] if k > start else way.R_before[c]
             transition(run, k - 1, R_last, F)
             step_forward(F_flat, now, run.dt_s[k - 1], q)
-            _drive(run, k - 1, R_last, way.further[k - 1], now_rows)
+            _drive(run, k - 1, R_last, way.further[k - 1], way.turning[k - 1], now_rows)
         m = kept.first[k - start]
         for i in range(sight.first[k], sight.first[k + 1]):
             if sight.use[i]:
