@@ -93,6 +93,17 @@ def compiled_inline(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return _kept(function, _nrt=False, forceinline=True, fastmath=_IN_ANY_ORDER)
 
 
+def compiled_callback(signature: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return what compiles a function for callers outside Python; they call the result's ``address``."""
+
+    def kept(function: Callable[..., Any]) -> Any:
+        with _NAMING:
+            numba.config.CACHE_DIR = str(_folder(function.__code__.co_filename))  # type: ignore[attr-defined]
+            return numba.cfunc(signature, cache=True)(function)
+
+    return kept
+
+
 def _kept(function: Callable[_P, _R], **options: bool | set[str]) -> Callable[_P, _R]:
     folder = _folder(function.__code__.co_filename)
     dispatcher: Any = njit(nogil=True, error_model="numpy", **options)(function)  # type: ignore[call-overload]

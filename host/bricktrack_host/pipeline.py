@@ -6,6 +6,7 @@ the stages.
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -37,6 +38,8 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
+_LONG_FRAMES = 900
+"""Half a minute: of fewer frames no array is large, and to be ready for those takes a third of a second."""
 LOADED_MEANWHILE = ("bricktrack_host.stages.solution", "bricktrack_host.stages.writing")
 
 
@@ -99,29 +102,39 @@ def process_run(
             rays = rays_of_recording(calibrated, unit=run.manifest.unit, sensor_mode=mode)
     problems = list(run.problems)
     pictures = RunPictures(run, frames)
-    with stages(FIND, frames.n_frames):
-        with ThreadPoolExecutor(1, "load") as beside:
-            # What comes later takes a second to load, SciPy most of it: it passes while pictures are decoded.
-            beside.map(import_module, LOADED_MEANWHILE)
-            lights = pictures.lights(rays, brick, settings.segmentation, stages.progress)
-        from bricktrack_host.stages.solution import solve_run
-        from bricktrack_host.stages.writing import write_run
-
-        observations = pictures.observations(lights, rays, brick, settings.segmentation)
-        del lights  # a third of a megabyte for each second recorded, which nobody needs any more
-    problems += pictures.problems()
-    result, fusions = solve_run(
-        run, observations, calibration=calibrated, rays=rays, brick=brick, settings=settings,
-        problems=problems, stages=stages, files=(calibration, layout),
-    )  # fmt: skip
     results_folder = output or folder / RESULTS_FOLDER
-    with stages("write report and tables"):
-        comparison, earlier = write_run(
-            result, results_folder, overlays=pictures.overlays(result.observations, result.optical),
-            calibration=calibrated, fusions=fusions, truth=find_truth(folder, truth),
+    with _memory(results_folder, frames.n_frames):
+        with stages(FIND, frames.n_frames):
+            with ThreadPoolExecutor(1, "load") as beside:
+                # What comes later takes a second to load, SciPy most of it: meanwhile pictures are decoded.
+                beside.map(import_module, LOADED_MEANWHILE)
+                lights = pictures.lights(rays, brick, settings.segmentation, stages.progress)
+            from bricktrack_host.stages.solution import solve_run
+            from bricktrack_host.stages.writing import write_run
+
+            observations = pictures.observations(lights, rays, brick, settings.segmentation)
+            del lights  # a third of a megabyte for each second recorded, which nobody needs any more
+        problems += pictures.problems()
+        result, fusions = solve_run(
+            run, observations, calibration=calibrated, rays=rays, brick=brick, settings=settings,
+            problems=problems, stages=stages, files=(calibration, layout),
         )  # fmt: skip
+        with stages("write report and tables"):
+            comparison, earlier = write_run(
+                result, results_folder, overlays=pictures.overlays(result.observations, result.optical),
+                calibration=calibrated, fusions=fusions, truth=find_truth(folder, truth),
+            )  # fmt: skip
     logger.info("%s: processed in %.1f s", folder.name, sum(stages.seconds.values()))
     return ProcessedRun(result, results_folder, results_folder / REPORT_NAME, comparison, earlier)
+
+
+def _memory(results: Path, n_frames: int) -> AbstractContextManager[None]:
+    """Return what keeps the memory that a long recording takes from growing with its length."""
+    if n_frames < _LONG_FRAMES:
+        return nullcontext()
+    from bricktrack_host.scratch_arrays import large_arrays_on_disk
+
+    return large_arrays_on_disk(next(folder for folder in results.absolute().parents if folder.is_dir()))
 
 
 def find_truth(folder: Path, truth: Path | None) -> Path | None:

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import av
@@ -16,11 +17,13 @@ from typer.testing import CliRunner
 from bricktrack_common.camera_model import SensorMode
 from bricktrack_common.errors import CalibrationError, ConfigError, RunFormatError, TrackingError, VideoError
 from bricktrack_common.run_manifest import MANIFEST_NAME, read_manifest, write_manifest
+from bricktrack_host import pipeline, scratch_arrays, scratch_kernel
 from bricktrack_host.calibration.calibration_file import load_calibration, save_calibration
 from bricktrack_host.cli import calibrate
 from bricktrack_host.cli.main import app
 from bricktrack_host.pipeline import ProcessSettings, process_run
 from bricktrack_host.quality import PoseFlag
+from bricktrack_host.results.result_store import results_id
 from bricktrack_host.viewing.overlay_video import write_overlay
 
 LAYOUT = SAMPLE / "layout.toml"
@@ -107,6 +110,20 @@ def test_processing_again_gives_the_same_bytes(processed, bench):
     process(bench, bench / "runs" / "sample_motion", truth=SAMPLE / "truth")
     assert {name: (processed.folder / name).read_bytes() for name in before} == before
     assert (processed.folder / "summary.json").read_bytes() == summary
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="arrays lie on the disk on Linux only")
+def test_a_recording_called_long_gives_the_same_bytes_with_its_arrays_on_the_disk(
+    processed, bench, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(pipeline, "_LONG_FRAMES", 1)
+    monkeypatch.setattr(scratch_arrays, "_OF_DISK", {})
+    monkeypatch.setattr(scratch_arrays, "_LEAST_BYTES", 2000)
+    monkeypatch.setattr(scratch_arrays, "_RESIDENT_BYTES", 1 << 18)
+    process(bench, bench / "runs" / "sample_motion", truth=SAMPLE / "truth", output=tmp_path / "results")
+    (scratch,) = scratch_arrays._OF_DISK.values()
+    assert scratch.numbers[scratch_kernel.USED] > 1 << 20
+    assert results_id(tmp_path / "results") == results_id(processed.folder)
 
 
 def test_the_report_stands_alone(processed):

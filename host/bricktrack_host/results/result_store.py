@@ -243,12 +243,13 @@ def _write_files(result: RunResult, folder: Path) -> None:
         edge_fit=result.edge_fit, metadata=metadata,
     )  # fmt: skip
     write("optical", optical)
+    del optical
     fused = fused_table(
         result.fused, edge_index=result.edge_index, t0_ns=t0_ns, rest=result.rest, from_rest=result.from_rest,
         edge_fit=result.edge_fit, metadata=metadata,
     )  # fmt: skip
     write("fused", fused)
-    del optical, fused
+    del fused
     leds = leds_table(result.observations, result.optical, result.led_names, t0_ns=t0_ns, metadata=metadata)
     write("leds", leds)
     del leds

@@ -1,6 +1,7 @@
 """The stage of writing: the tables and, beside them, the page."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from pathlib import Path
 
 from bricktrack_host.calibration.calibration_file import Calibration
@@ -48,7 +49,7 @@ def write_run(
 
     with ThreadPoolExecutor(1) as beside:
         # Tables are packed without the interpreter's lock, and wait for the disk: the page is made meanwhile.
-        reported = beside.submit(report)
+        reported = beside.submit(copy_context().run, report)  # whose large arrays lie where others do
 
         def write_page(partial: Path) -> None:
             save_pictures(partial / PICTURES_NAME, overlays, covered)

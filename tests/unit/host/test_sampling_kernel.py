@@ -28,7 +28,8 @@ def test_covariances_are_carried_by_the_derivative_and_linear_between_nodes():
     to_mm = np.repeat([1.0, 1e3], 3)
     expected = H @ between @ np.swapaxes(H, 1, 2) + common
     expected += np.repeat(further, 3, axis=1)[:, :, None] * np.eye(6)
-    found = covariance_between(at_nodes, of, node, share, R, turn, v_origin, since, arm, further, common)
+    found = np.empty((len(node), 6, 6))
+    covariance_between(at_nodes, of, node, share, R, turn, v_origin, since, arm, further, common, found)
     np.testing.assert_allclose(found, expected * to_mm[:, None] * to_mm, rtol=1e-12, atol=1e-9)
     np.testing.assert_array_equal(found, np.swapaxes(found, 1, 2))
 

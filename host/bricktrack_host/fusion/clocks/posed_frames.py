@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
-from bricktrack_host.fusion.clocks.rotation_fit_kernel import compare_with_gyro, integrated_attitudes
+from bricktrack_host.fusion.clocks.rotation_fit_kernel import compare_with_gyro, integrate_attitudes
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 
 MIN_POSES = 20
@@ -57,7 +57,9 @@ class FramesBesideGyro:
 
     def integrated(self, bias_radps: FloatArray) -> FloatArray:
         """Return the gyro's attitudes, less a bias, at even instants of its own: for `compared`."""
-        return integrated_attitudes(self._pieces, self._nodes_s, bias_radps)
+        R = np.empty((len(self._nodes_s), 3, 3))
+        integrate_attitudes(self._pieces, self._nodes_s, bias_radps, R)
+        return R
 
     def compared(
         self,

@@ -17,12 +17,13 @@ _RIDGE = 1e-12  # of the largest knot: one without frames is held at zero
 
 
 @compiled
-def integrated_attitudes(pieces: GyroPieces, nodes_s: FloatArray, bias_radps: FloatArray) -> FloatArray:
-    """Return the gyro's attitudes at instants seen from the first, shape (n, 3, 3).
+def integrate_attitudes(
+    pieces: GyroPieces, nodes_s: FloatArray, bias_radps: FloatArray, out: FloatArray
+) -> None:
+    """Write the gyro's attitudes at instants seen from the first, shape (n, 3, 3).
 
     Over 2.5 ms the integral of the rate is the rotation vector: coning is below 1e-8 rad.
     """
-    out = np.empty((len(nodes_s), 3, 3))
     R, turn, before = np.eye(3), np.empty(3), np.empty(3)
     i = 0
     for n in range(len(nodes_s)):
@@ -36,7 +37,6 @@ def integrated_attitudes(pieces: GyroPieces, nodes_s: FloatArray, bias_radps: Fl
         if n > 0:
             turn_by(R, turn)
         out[n] = R
-    return out
 
 
 @compiled
@@ -54,7 +54,7 @@ def compare_with_gyro(
     Parameters
     ----------
     nodes_s, node_attitude, bias_radps : ndarray, shape (k,), (k, 3, 3), (3,)
-        As `integrated_attitudes` gave them.
+        As `integrate_attitudes` wrote them.
     t_imu_s, since_mid_s : ndarray, shape (n,)
         Of the frames: IMU time, and camera time after the middle.
     R : ndarray, shape (n, 3, 3)

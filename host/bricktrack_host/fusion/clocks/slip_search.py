@@ -19,7 +19,7 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.clocks.offset_change import offset_change, signal_of
 from bricktrack_host.fusion.clocks.posed_frames import MIN_POSES
 from bricktrack_host.fusion.clocks.rate_correlation import correlate
-from bricktrack_host.fusion.clocks.rotation_fit_kernel import integrated_attitudes
+from bricktrack_host.fusion.clocks.rotation_fit_kernel import integrate_attitudes
 from bricktrack_host.fusion.clocks.slip_search_kernel import (
     likeliest_shifts,
     path_costs,
@@ -175,7 +175,8 @@ def _turns(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment, perio
     if len(frame) < MIN_POSES:
         return []
     instants, which = np.unique(t_s, return_inverse=True)
-    A = integrated_attitudes(signal.gyro_pieces(), instants, alignment.gyro_bias_radps)
+    A = np.empty((len(instants), 3, 3))
+    integrate_attitudes(signal.gyro_pieces(), instants, alignment.gyro_bias_radps, A)
     A = A[which.reshape(t_s.shape)]
     R = optical.R_camera_brick[frame]
     start = R[0] @ A[0, A.shape[1] // 2].T

@@ -52,10 +52,11 @@ def sample_motion(
         camera = run.camera.still_omega_radps(at.t_s)
         turn = turn - np.einsum("nji,nj->ni", R, camera)
         v_seen_mps = v_mps - np.cross(camera, p_m)
-    P = covariance_between(
+    P = np.empty((len(output_t_ns), 6, 6))
+    covariance_between(
         np.ascontiguousarray(estimate.covariance[:, b]), np.searchsorted(estimate.of, SEEN), at.node,
         at.share if is_smoothed else np.zeros(len(at.share)), R, turn, v_seen_mps, at.t_cam_s - run.t_mid_s,
-        arm_m, _bridge(problem, b, at, is_smoothed=is_smoothed), common,
+        arm_m, _bridge(problem, b, at, is_smoothed=is_smoothed), common, P,
     )  # fmt: skip
     flags = _flags(run, at.t_cam_s, at.t_s, seen_cam_s, settings)
     flags[at.is_outside] |= int(PoseFlag.EXTRAPOLATED)

@@ -155,8 +155,9 @@ def covariance_between(
     arm_m: FloatArray,
     further: FloatArray,
     common: FloatArray,
-) -> FloatArray:
-    """Return the covariance of poses between nodes, shape (n, 6, 6), of ``[dtheta rad, dt mm]``.
+    out: FloatArray,
+) -> None:
+    """Write the covariance of poses between nodes, shape (n, 6, 6), of ``[dtheta rad, dt mm]``.
 
     H C H^T with the derivative H of `smoother.observe`, and what is added.
 
@@ -178,7 +179,7 @@ def covariance_between(
         Added to each.
     """
     n, c = len(node), len(of)
-    out, half, between, H = np.empty((n, 6, 6)), np.empty((6, c)), np.empty((c, c)), np.zeros((6, c))
+    half, between, H = np.empty((6, c)), np.empty((c, c)), np.zeros((6, c))
     for a in range(6):
         H[a, a] = 1.0
     for i in range(n):
@@ -209,4 +210,3 @@ def covariance_between(
                 if p == q:
                     total += further[i, p // 3]
                 out[i, p, q] = out[i, q, p] = total * (1e3 if p > 2 else 1.0) * (1e3 if q > 2 else 1.0)
-    return out

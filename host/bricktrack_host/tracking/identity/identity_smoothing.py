@@ -13,7 +13,7 @@ from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.tracking.identity.identity_motion import run_motion, unknown_motion
 from bricktrack_host.tracking.identity.run_identities import RunIdentities
-from bricktrack_host.tracking.identity.smoothing_kernel import banded_equations
+from bricktrack_host.tracking.identity.smoothing_kernel import N_BANDS, banded_equations
 from bricktrack_host.tracking.identity.verification import motion_of
 from bricktrack_host.tracking.pose.refine import LedMotion, pose_equations
 
@@ -94,7 +94,9 @@ def _smoothed(
         A, g = pose_equations(
             uv, noise, R, t_mm, run.ray_model, run.brick_model, collar_mm=run.collar_mm, motion=within
         )
-        equations = banded_equations(A, g, R, t_mm, ends, _LEAST, _MOST)
+        banded, right = np.zeros((N_BANDS, *g.shape)), np.empty_like(g)
+        banded_equations(A, g, R, t_mm, ends, _LEAST, _MOST, banded, right)
+        equations = banded.reshape(N_BANDS, -1), right.ravel()
         step = np.asarray(solveh_banded(*equations, lower=True, overwrite_ab=True)).reshape(-1, 6)
         R, t_mm = R @ matrix_from_rvec(step[:, :3]), t_mm + step[:, 3:]
         if (np.abs(step).max(axis=0) < np.repeat(_LEAST, 3)).all():

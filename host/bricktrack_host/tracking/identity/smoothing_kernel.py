@@ -20,8 +20,10 @@ def banded_equations(
     ends: IntArray,
     least: FloatArray,
     most: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the equations of all frames' steps, as `scipy.linalg.solveh_banded` takes them (lower part).
+    banded: FloatArray,
+    right: FloatArray,
+) -> None:
+    """Write the equations of all frames' steps, as `scipy.linalg.solveh_banded` takes them (lower part).
 
     Parameters
     ----------
@@ -32,16 +34,14 @@ def banded_equations(
         Behind each part's last frame; frames of a part, five at least, follow each other.
     least, most : ndarray, shape (2,), rad and mm
         Limits of what the differences of most frames of a part are taken to be.
-
-    Returns
-    -------
-    banded : ndarray, shape (30, 6 n)
-    right : ndarray, shape (6 n,)
+    banded : ndarray, shape (30, n, 6)
+        Written; zeros before.
+    right : ndarray, shape (n, 6)
+        Written.
     """
-    n = len(A)
-    banded, right = np.zeros((N_BANDS, n, 6)), g.copy()
-    for i in range(n):
+    for i in range(len(A)):
         for row in range(6):
+            right[i, row] = g[i, row]
             for column in range(row + 1):
                 banded[row - column, i, column] = A[i, row, column]
             banded[0, i, row] += 1e-9
@@ -66,4 +66,3 @@ def banded_equations(
                             more = _DIFFERENCE[a] * _DIFFERENCE[b] * weight
                             banded[6 * (a - b), begin + i + b, c] += more
         begin = end
-    return banded.reshape(N_BANDS, 6 * n), right.reshape(6 * n)

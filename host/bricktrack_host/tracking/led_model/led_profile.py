@@ -131,7 +131,10 @@ def predict_leds(
     polynomials = hit_polynomials(ray_model)
     hits = expand_at(polynomials, uv)
     a, b = polynomials.plane_a_mm, polynomials.plane_b_mm
-    flat, J_centre, J_axis = _predict_all(
+    n = uv.size // 2
+    flat, shape = np.empty((n, 6)), np.empty((n, N_SHAPE))
+    J_centre, J_axis = np.empty((n, 2, 3)), np.empty((n, 2, 3))
+    _predict_all(
         uv.reshape(-1, 2),
         np.ascontiguousarray(centres.reshape(-1, 3)),
         np.ascontiguousarray(axes.reshape(-1, 3)),
@@ -141,6 +144,10 @@ def predict_leds(
         hits.reshape(-1, 6, 4),
         a,
         b - a,
+        shape,
+        flat,
+        J_centre,
+        J_axis,
     )
     out = flat.reshape(*lead, 6)
     return LedPrediction(
@@ -172,12 +179,13 @@ def _predict_all(
     hits: FloatArray,
     plane_a: float,
     apart: float,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return centroid, area, facing and what is across the axis, (n, 6), and both Jacobians, (n, 2, 3)."""
-    n = len(uv)
-    out, J_centre, J_axis = np.empty((n, 6)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
-    shape = np.empty((n, N_SHAPE))
-    for i in range(n):
+    shape: FloatArray,
+    out: FloatArray,
+    J_centre: FloatArray,
+    J_axis: FloatArray,
+) -> None:
+    """Write centroid, area, facing and what is across the axis, (n, 6), and both Jacobians, (n, 2, 3)."""
+    for i in range(len(uv)):
         led_shape(centres[i], axes[i], radii[i], tables, kind[i], hits, i, plane_a, apart, shape)
         du, dv, facing, magnification, shown_u, shown_v = led_view(
             centres[i], axes[i], hits, i, plane_a, apart, shape, J_centre[i], J_axis[i]
@@ -185,7 +193,6 @@ def _predict_all(
         out[i, 0], out[i, 1] = uv[i, 0] + du, uv[i, 1] + dv
         out[i, 2], out[i, 3] = shape[i, AREA] * magnification, facing
         out[i, 4], out[i, 5] = shown_u, shown_v
-    return out, J_centre, J_axis
 
 
 def predict_brick(
@@ -213,7 +220,9 @@ def predict_brick(
     P, N = brick_model.led_positions_mm, brick_model.led_axes
     R = np.ascontiguousarray(R_camera_brick if R_camera_brick.ndim == 4 else R_camera_brick[:, None])
     t = np.ascontiguousarray(t_camera_brick_mm if t_camera_brick_mm.ndim == 3 else t_camera_brick_mm[:, None])
-    centres, axes = _placed(R, t, P, N)
+    lead = len(R), len(P)
+    centres, axes, J = np.empty((*lead, 3)), np.empty((*lead, 3)), np.empty((*lead, 2, 6))
+    _place(R, t, P, N, centres, axes)
     prediction = predict_leds(
         centres,
         axes,
@@ -222,34 +231,33 @@ def predict_brick(
         collar_mm=collar_mm,
         shift_sd_per_radius=shift_per_radius(collar_mm, brick_model),
     )
-    return prediction, _by_pose(R, P, N, prediction.J_px_per_mm, prediction.J_px_per_axis)
+    _by_pose(R, P, N, prediction.J_px_per_mm, prediction.J_px_per_axis, J)
+    return prediction, J
 
 
 @compiled
-def _placed(R: FloatArray, t: FloatArray, P: FloatArray, N: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return LEDs' centres and axes, (n, n_leds, 3), of poses (n, m, ...), one for all LEDs or each one's."""
-    n, n_leds = len(R), len(P)
-    centres, axes = np.empty((n, n_leds, 3)), np.empty((n, n_leds, 3))
-    for i in range(n):
-        for k in range(n_leds):
+def _place(
+    R: FloatArray, t: FloatArray, P: FloatArray, N: FloatArray, centres: FloatArray, axes: FloatArray
+) -> None:
+    """Write LEDs' centres and axes, (n, n_leds, 3), of poses (n, m, ...), one for all LEDs or each one's."""
+    for i in range(len(R)):
+        for k in range(len(P)):
             at, from_ = min(k, R.shape[1] - 1), min(k, t.shape[1] - 1)
             for r in range(3):
                 x, y, z = R[i, at, r, 0], R[i, at, r, 1], R[i, at, r, 2]
                 centres[i, k, r] = x * P[k, 0] + y * P[k, 1] + z * P[k, 2] + t[i, from_, r]
                 axes[i, k, r] = x * N[k, 0] + y * N[k, 1] + z * N[k, 2]
-    return centres, axes
 
 
 @compiled
 def _by_pose(
-    R: FloatArray, P: FloatArray, N: FloatArray, J_centre: FloatArray, J_axis: FloatArray
-) -> FloatArray:
-    """Return derivatives of pixels by turn and shift, (n, n_leds, 2, 6), of those by centres and axes.
+    R: FloatArray, P: FloatArray, N: FloatArray, J_centre: FloatArray, J_axis: FloatArray, J: FloatArray
+) -> None:
+    """Write derivatives of pixels by turn and shift, (n, n_leds, 2, 6), of those by centres and axes.
 
     A turn theta, brick axes, moves a centre by R (theta x P): its row is P x (R' J).
     """
     n, n_leds = J_centre.shape[:2]
-    J = np.empty((n, n_leds, 2, 6))
     c, a = np.empty(3), np.empty(3)
     for i in range(n):
         for k in range(n_leds):
@@ -263,7 +271,6 @@ def _by_pose(
                 out[0] = P[k, 1] * c[2] - P[k, 2] * c[1] + N[k, 1] * a[2] - N[k, 2] * a[1]
                 out[1] = P[k, 2] * c[0] - P[k, 0] * c[2] + N[k, 2] * a[0] - N[k, 0] * a[2]
                 out[2] = P[k, 0] * c[1] - P[k, 1] * c[0] + N[k, 0] * a[1] - N[k, 1] * a[0]
-    return J
 
 
 def collar_of(brick_model: BrickModel) -> float | None:
