@@ -11,9 +11,12 @@ from typing import Literal, Protocol
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_host.reporting.thinning import thinned_dots
 
 UNITS_PER_PT = 20
 _WORDS_PT = 8.5
+_CELLS_OF_DOT = 4
+"""Dots closer together than this part of their width are one."""
 _NOWHERE = np.empty(0)
 _TEXT = "S8"
 """Short pieces of ASCII side by side in an array, filled up with zero bytes."""
@@ -140,7 +143,8 @@ class Scatter:
         """See `Mark`."""
         known = np.isfinite(self.x) & np.isfinite(self.y)
         # A stroke of no length with round ends is a dot; all of them are one path.
-        steps = _steps(to_page(self.x[known], self.y[known]))
+        places = to_page(self.x[known], self.y[known])
+        steps = _steps(thinned_dots(places, max(units(self.size_pt) // _CELLS_OF_DOT, 1)))
         path = _repeated("m%s %sh0", steps)
         opacity = f' stroke-opacity="{self.opacity:g}"' if self.opacity < 1 else ""
         dots = f'<path {_stroke(self.colour, self.size_pt)} stroke-linecap="round"{opacity} d="{path}"/>'

@@ -1,4 +1,4 @@
-"""A line with more samples than a page has pixels, thinned so that its picture stays the same."""
+"""Lines and dots with more samples than a page has pixels, thinned so that their picture stays the same."""
 
 import numpy as np
 
@@ -72,3 +72,25 @@ def thinned_band(
         np.repeat(np.fmin.reduceat(low, starts), 2),
         np.repeat(np.fmax.reduceat(high, starts), 2),
     )
+
+
+def thinned_dots(places: IntArray, cell: int) -> IntArray:
+    """Return the dots without those that lie where one before them does, of very many.
+
+    Parameters
+    ----------
+    places : ndarray of int64, shape (n, 2)
+        In units of the page.
+    cell : int
+        Side of the squares of which each holds one dot, in the same units: far below a dot's width.
+
+    Returns
+    -------
+    places : ndarray of int64, shape (m, 2)
+        In the order given.
+    """
+    if len(places) <= 4 * N_COLUMNS:
+        return places
+    column, row = (places // cell).T
+    _, first = np.unique(column * (np.ptp(row) + 1) + row - row.min(), return_index=True)
+    return np.asarray(places[np.sort(first)], dtype=np.int64)

@@ -1,10 +1,10 @@
-"""Thinned lines and bands keep their picture."""
+"""Thinned lines, bands and dots keep their picture."""
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bricktrack_host.reporting.thinning import thinned, thinned_band
+from bricktrack_host.reporting.thinning import thinned, thinned_band, thinned_dots
 
 
 def drawn(t_s, y):
@@ -68,3 +68,14 @@ def test_a_thinned_band_covers_all_of_it():
     assert (low.min(), high.max()) == (-9.0, 9.0)
     assert (np.interp(t_s, t, high) >= half - 0.25).all()  # slopes between columns
     assert (np.interp(t_s, t, low) <= 0.25 - half).all()
+
+
+def test_of_dots_on_top_of_each_other_one_is_left_and_few_dots_all_stay():
+    rng = np.random.default_rng(5)
+    places = np.stack([rng.integers(-30, 4000, 60_000), rng.normal(0, 20, 60_000).astype(int)], axis=1)
+    places[31_234] = (2000, 900)  # a dot alone must not go
+    left = thinned_dots(places, 5)
+    assert len(left) < 15_000
+    assert [2000, 900] in left.tolist()
+    assert {tuple(cell) for cell in (left // 5).tolist()} == {tuple(cell) for cell in (places // 5).tolist()}
+    assert np.array_equal(thinned_dots(places[:900], 5), places[:900])
