@@ -1,10 +1,13 @@
 """The stream of inertial samples: raw BNO055 registers as read, and what they mean in units."""
 
-from collections.abc import Iterable
+import math
+from array import array
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntFlag
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO, Literal
 
 import msgspec
 import numpy as np
@@ -12,7 +15,7 @@ from numpy.typing import NDArray
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.errors import RunFormatError
-from bricktrack_common.streams import Field, StreamSchema, read_stream, write_stream
+from bricktrack_common.streams import Field, StreamSchema, pass_records, write_stream
 from bricktrack_common.typed_data import convert
 
 FIRST_REGISTER = 0x08
@@ -23,6 +26,7 @@ N_DATA_BYTES = LAST_REGISTER - FIRST_REGISTER + 1
 STANDARD_GRAVITY_MPS2 = 9.80665
 _MAX_ACC_STEP_MPS2 = 300.0  # between samples 10 ms apart; 30 g is the worst impact expected on a table
 _MAX_GYRO_STEP_RADPS = 40.0
+_LATE_NS = 2_000_000
 _LONGEST_READ_NS = 10_000_000  # a burst at 100 kHz takes 5 ms, and the chip stretches the clock
 
 IMU_SCHEMA = StreamSchema(
@@ -173,52 +177,121 @@ def read_imu(path: Path) -> tuple[ImuDescription, list[ImuRecord], int]:
     RunFormatError
         If it is no inertial stream, or slots do not increase.
     """
-    contents = read_stream(path, IMU_SCHEMA)
-    description = convert(contents.meta, ImuDescription, where=f"{path}: header", error=RunFormatError)
-    columns = (contents.columns[f.name] for f in IMU_SCHEMA.fields)
-    records = [ImuRecord(*row) for row in zip(*columns, strict=True)]
-    for i, record in enumerate(records):
-        if i and record.slot <= records[i - 1].slot:
+    records: list[ImuRecord] = []
+    description, leftover_bytes = _pass_imu(path, records.append)
+    return description, records, leftover_bytes
+
+
+def read_imu_samples(path: Path) -> tuple[ImuDescription, ImuSamples, int]:
+    """Return a sensor's description, its samples (`decode_imu`) and the bytes left over.
+
+    Raises
+    ------
+    RunFormatError
+        As `read_imu`, or if the grid is damaged.
+    """
+    reads = _Reads()
+    description, leftover_bytes = _pass_imu(path, reads.add)
+    return description, reads.decoded(description), leftover_bytes
+
+
+def _pass_imu(path: Path, take: Callable[[ImuRecord], None]) -> tuple[ImuDescription, int]:
+    i, last_slot = 0, -math.inf
+
+    def checked(row: list[Any]) -> None:
+        nonlocal i, last_slot
+        record = ImuRecord(*row)
+        if record.slot <= last_slot:
             raise RunFormatError(
                 f"{path}: slot {record.slot} of record {i} does not come after the one before"
             )
         if record.data is not None and len(record.data) != N_DATA_BYTES:
             raise RunFormatError(f"{path}: record {i}: {len(record.data)} bytes; expected {N_DATA_BYTES}")
-    return description, records, contents.leftover_bytes
+        take(record)
+        i, last_slot = i + 1, record.slot
+
+    meta, leftover_bytes = pass_records(path, IMU_SCHEMA, checked)
+    return convert(meta, ImuDescription, where=f"{path}: header", error=RunFormatError), leftover_bytes
 
 
-def decode_imu(description: ImuDescription, records: list[ImuRecord]) -> ImuSamples:
-    """Turn raw registers into units, put gaps where slots are missing, and flag what cannot be trusted."""
-    if not records:
-        empty = np.empty((0, 3))
-        zero = np.empty(0, dtype=np.int64)
-        return ImuSamples(
-            zero, empty, empty.copy(), np.empty((0, 4)), np.empty(0), np.empty(0, np.uint8), zero.copy()
-        )
-    first = records[0].slot
-    n = records[-1].slot - first + 1
-    if n > 50 * len(records) + 100_000:
-        raise RunFormatError(
-            f"imu {description.name}: {len(records)} records over {n} slots; the grid is damaged"
-        )
-    t_due = description.t0_ns + (first + np.arange(n, dtype=np.int64)) * description.period_ns
-    t_ns = t_due.copy()
-    raw = np.zeros((n, N_DATA_BYTES), dtype=np.uint8)
-    flags = np.full(n, int(ImuFlag.GAP), dtype=np.int64)
-    mode_wrong = np.zeros(n, dtype=np.bool_)
-    wrong, since = False, 0
-    longest_ns = max(description.period_ns, _LONGEST_READ_NS)
+def decode_imu(description: ImuDescription, records: Iterable[ImuRecord]) -> ImuSamples:
+    """Turn raw registers into units, put gaps where slots are missing, and flag what cannot be trusted.
+
+    Raises
+    ------
+    RunFormatError
+        If slots lie far apart, or a number does not fit 64 bits: the grid is damaged.
+    """
+    reads = _Reads()
     for record in records:
-        i = record.slot - first
+        reads.add(record)
+    return reads.decoded(description)
+
+
+class _Reads:
+    """Records as they come, kept as numbers: as objects they would take five times the memory."""
+
+    def __init__(self) -> None:
+        self._slot, self._before_ns, self._after_ns = array("q"), array("q"), array("q")
+        self._data, self._is_read = bytearray(), bytearray()
+        self._modes: list[tuple[int, int]] = []
+        """Slot and operation mode, where it was read."""
+
+    def add(self, record: ImuRecord) -> None:
+        """Take one record, of a slot after the last."""
+        try:
+            self._slot.append(record.slot)
+            self._before_ns.append(record.t_before_ns)
+            self._after_ns.append(record.t_after_ns)
+        except OverflowError:
+            raise RunFormatError(
+                f"inertial record {len(self._is_read)}: a number does not fit 64 bits"
+            ) from None
+        self._data += record.data or bytes(N_DATA_BYTES)
+        self._is_read.append(record.data is not None)
         if record.status is not None and len(record.status) == 3:
-            mode_wrong[since:i] = wrong
-            wrong, since = record.status[2] != description.opr_mode, i
-        if record.data is not None and record.t_after_ns - record.t_before_ns <= longest_ns:
-            raw[i] = np.frombuffer(record.data, dtype=np.uint8)
-            t_ns[i] = (record.t_before_ns + record.t_after_ns) // 2 + description.latency_ns
-            late = record.t_before_ns - t_due[i] > 2_000_000
-            flags[i] = int(ImuFlag.LATE) if late else 0
-    mode_wrong[since:] = wrong
+            self._modes.append((record.slot, record.status[2]))
+
+    def decoded(self, description: ImuDescription) -> ImuSamples:
+        """Return the samples; see `decode_imu`."""
+        if not self._slot:
+            empty = np.empty((0, 3))
+            zero = np.empty(0, dtype=np.int64)
+            return ImuSamples(
+                zero, empty, empty.copy(), np.empty((0, 4)), np.empty(0), np.empty(0, np.uint8), zero.copy()
+            )
+        first = self._slot[0]
+        n = self._slot[-1] - first + 1
+        if n > 50 * len(self._slot) + 100_000:
+            raise RunFormatError(
+                f"imu {description.name}: {len(self._slot)} records over {n} slots; the grid is damaged"
+            )
+        before_ns, after_ns = (np.frombuffer(t, dtype=np.int64) for t in (self._before_ns, self._after_ns))
+        took_ns = after_ns - before_ns
+        longest_ns = max(description.period_ns, _LONGEST_READ_NS)
+        known = np.frombuffer(self._is_read, dtype=np.bool_) & (took_ns >= 0) & (took_ns <= longest_ns)
+        t_due = description.t0_ns + (first + np.arange(n, dtype=np.int64)) * description.period_ns
+        t_ns = t_due.copy()
+        raw = np.zeros((n, N_DATA_BYTES), dtype=np.uint8)
+        flags = np.full(n, int(ImuFlag.GAP), dtype=np.int64)
+        at = np.frombuffer(self._slot, dtype=np.int64)[known] - first
+        raw[at] = np.frombuffer(self._data, dtype=np.uint8).reshape(-1, N_DATA_BYTES)[known]
+        t_ns[at] = (before_ns + took_ns // 2)[known] + description.latency_ns
+        flags[at] = np.where(before_ns[known] - t_due[at] > _LATE_NS, int(ImuFlag.LATE), 0)
+        mode_wrong = np.zeros(n, dtype=np.bool_)
+        for (slot, mode), (next_slot, _) in pairwise([*self._modes, (first + n, 0)]):
+            mode_wrong[slot - first : next_slot - first] = mode != description.opr_mode
+        return _in_units(description, t_ns, raw, flags, mode_wrong)
+
+
+def _in_units(
+    description: ImuDescription,
+    t_ns: IntArray,
+    raw: NDArray[np.uint8],
+    flags: IntArray,
+    mode_wrong: NDArray[np.bool_],
+) -> ImuSamples:
+    """Return samples of every slot's registers; ``flags`` holds gaps and late reads, and is filled in."""
     words = raw.view("<i2").astype(np.float64)  # 23 words from register 0x08
     acc = words[:, 0:3] / description.acc_lsb_per_mps2
     gyro_dps = words[:, 6:9] / description.gyro_lsb_per_dps

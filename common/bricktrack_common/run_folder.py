@@ -11,7 +11,7 @@ from bricktrack_common.arrays import IntArray
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.frame_times import FrameTimes, read_frames
-from bricktrack_common.imu_records import ImuDescription, ImuSamples, decode_imu, read_imu
+from bricktrack_common.imu_records import ImuDescription, ImuSamples, read_imu_samples
 from bricktrack_common.run_manifest import (
     EDGES_NAME,
     FRAMES_NAME,
@@ -131,9 +131,9 @@ def read_run(folder: Path, *, verify_hashes: bool = False) -> Run:
         name = f"imu_{described.name}.msgpack"
         if name not in present:
             continue
-        description, records, leftover = read_imu(folder / name)
+        description, samples, leftover = read_imu_samples(folder / name)
         _note_cut(problems, name, leftover)
-        imus[description.name] = (description, decode_imu(description, records))
+        imus[description.name] = (description, samples)
     edges = np.empty(0, dtype=np.int64)
     if EDGES_NAME in present:
         edges, leftover = read_edges(folder / EDGES_NAME)

@@ -4,7 +4,7 @@ A stream may end in the middle of a record, when power was cut: the reader retur
 it and says how many bytes were left over. It refuses a newer version by name, and never guesses.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -97,40 +97,65 @@ def read_stream(path: Path, schema: StreamSchema) -> StreamContents:
     Raises
     ------
     RunFormatError
-        If the file cannot be read, is no stream of this schema, is of a newer version, or holds a
-        record of the wrong shape or type (which is damage, not a cut).
+        As `pass_records` says.
     """
+    columns: dict[str, list[Any]] = {f.name: [] for f in schema.fields}
+    appends = [column.append for column in columns.values()]
+
+    def take(record: list[Any]) -> None:
+        for append, value in zip(appends, record, strict=True):
+            append(value)
+
+    meta, leftover_bytes = pass_records(path, schema, take)
+    return StreamContents(meta=meta, columns=columns, leftover_bytes=leftover_bytes)
+
+
+def pass_records(
+    path: Path, schema: StreamSchema, take: Callable[[list[Any]], None]
+) -> tuple[dict[str, Any], int]:
+    """Hand the whole records of a stream on, one after the other, without keeping them.
+
+    Returns
+    -------
+    meta : dict
+        What the writer put in the header beside the schema.
+    leftover_bytes : int
+        Bytes after the last whole record; not 0 means that the stream was cut.
+
+    Raises
+    ------
+    RunFormatError
+        If the file cannot be read, is no stream of this schema, is of a newer version, or holds a
+        record of the wrong shape or type (which is damage, not a cut). ``take`` may raise it as well.
+    """
+    n_bytes, whole_bytes, n = 0, 0, 0
     try:
-        data = path.read_bytes()
-    except OSError as e:
-        raise RunFormatError(f"{path}: {e.strerror or e}") from e
-    unpacker = msgpack.Unpacker(
-        raw=False, strict_map_key=True, max_buffer_size=len(data) + 1, max_str_len=_MAX_RECORD_BYTES,
-        max_bin_len=_MAX_RECORD_BYTES, max_array_len=4096, max_map_len=4096, max_ext_len=0,
-    )  # fmt: skip
-    unpacker.feed(data)
-    whole_bytes = 0
-    rows: list[list[Any]] = []
-    try:
-        header = unpacker.unpack()
-        meta = _check_header(header, schema, path)
-        whole_bytes = unpacker.tell()
-        while True:
-            record = unpacker.unpack()
-            _check_record(record, schema, path, len(rows))
-            rows.append(record)
-            whole_bytes = unpacker.tell()
+        with path.open("rb") as file:
+            n_bytes = path.stat().st_size
+            unpacker = msgpack.Unpacker(
+                file, raw=False, strict_map_key=True, max_buffer_size=n_bytes + 1,
+                max_str_len=_MAX_RECORD_BYTES, max_bin_len=_MAX_RECORD_BYTES, max_array_len=4096,
+                max_map_len=4096, max_ext_len=0,
+            )  # fmt: skip
+            meta = _check_header(unpacker.unpack(), schema, path)
+            while True:
+                whole_bytes = unpacker.tell()
+                record = unpacker.unpack()
+                _check_record(record, schema, path, n)
+                take(record)
+                n += 1
     except msgpack.OutOfData:
         if whole_bytes == 0:
             raise RunFormatError(
-                f"{path}: {len(data)} bytes, no whole header; not a {schema.name} stream"
+                f"{path}: {n_bytes} bytes, no whole header; not a {schema.name} stream"
             ) from None
+    except OSError as e:
+        raise RunFormatError(f"{path}: {e.strerror or e}") from e
     except (ValueError, TypeError, msgpack.UnpackException) as e:
         if isinstance(e, RunFormatError):
             raise
-        raise RunFormatError(f"{path}: damaged at byte {whole_bytes}, after {len(rows)} records: {e}") from e
-    columns = {f.name: [row[i] for row in rows] for i, f in enumerate(schema.fields)}
-    return StreamContents(meta=meta, columns=columns, leftover_bytes=len(data) - whole_bytes)
+        raise RunFormatError(f"{path}: damaged at byte {whole_bytes}, after {n} records: {e}") from e
+    return meta, n_bytes - whole_bytes
 
 
 def _check_header(header: object, schema: StreamSchema, path: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from bricktrack_common.imu_records import (
     ImuRecord,
     decode_imu,
     read_imu,
+    read_imu_samples,
     write_imu,
 )
 
@@ -59,6 +60,8 @@ def test_a_read_that_outlasts_its_slot_is_a_gap_for_nobody_knows_when_it_was_mea
     s = decode([record(0, burst(0)), hung, record(81, burst(81))])
     assert s.flags[1] == ImuFlag.GAP and np.isnan(s.acc_mps2[1:81]).all()
     assert (np.diff(s.t_ns) > 0).all()
+    backwards = dataclasses.replace(hung, t_after_ns=hung.t_before_ns - 1)
+    assert decode([backwards]).flags.tolist() == [ImuFlag.GAP]
     just_in_time = dataclasses.replace(hung, t_after_ns=hung.t_before_ns + AMG.period_ns)
     assert decode([just_in_time]).flags.tolist() == [0]
 
@@ -170,6 +173,17 @@ def test_the_stream_survives_the_disk(tmp_path):
     with path.open("wb") as file:
         write_imu(file, AMG, records)
     assert read_imu(path) == (AMG, records, 0)
+    description, samples, leftover = read_imu_samples(path)
+    assert (description, leftover) == (AMG, 0)
+    for field, values in dataclasses.asdict(decode(records)).items():
+        np.testing.assert_array_equal(getattr(samples, field), values)
+
+
+def test_numbers_beyond_64_bits_and_a_torn_grid_are_errors_and_no_arrays():
+    with pytest.raises(RunFormatError, match="record 1: a number does not fit 64 bits"):
+        decode([record(0, burst(0)), record(1 << 64, burst(1))])
+    with pytest.raises(RunFormatError, match="2 records over 1000000001 slots; the grid is damaged"):
+        decode([record(0, burst(0)), record(10**9, burst(1))])
 
 
 def test_slots_out_of_order_and_short_bursts_are_refused(tmp_path):
