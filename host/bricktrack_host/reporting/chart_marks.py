@@ -15,7 +15,7 @@ from bricktrack_host.reporting.thinning import thinned_dots
 
 UNITS_PER_PT = 20
 _WORDS_PT = 8.5
-_CELLS_OF_DOT = 4
+_CELLS_OF_DOT = 3
 """Dots closer together than this part of their width are one."""
 _NOWHERE = np.empty(0)
 _TEXT = "S8"
