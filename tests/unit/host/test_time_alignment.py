@@ -113,6 +113,17 @@ def test_what_turns_while_no_sample_is_there_is_no_bias_of_the_gyro():
     assert found.gyro_bias_radps == pytest.approx([0.008, -0.005, 0.011], abs=0.002)
 
 
+def test_a_bias_that_turns_the_integrated_gyro_over_and_over_does_not_matter():
+    # 3.1 deg/s over 130 s is once round: attitudes by the gyro alone are anywhere in between.
+    shake = simulate_shake(3, offset_s=0.012, skew=2e-5, duration_s=130.0)
+    far = np.array([0.046, -0.024, 0.016])
+    bias = far + np.array([0.008, -0.005, 0.011])
+    found = align_times(shake.optical, replace(shake.imu, gyro_radps=shake.imu.gyro_radps + far))
+    assert abs(found.offset_ns - 12e6) < 4 * found.offset_sd_ns < 0.12e6
+    assert abs(found.skew - 2e-5) < 4 * found.skew_sd
+    assert found.gyro_bias_radps == pytest.approx(bias, abs=1e-4)
+
+
 def test_gaps_on_both_sides_do_not_matter():
     s = simulate_shake(
         10, offset_s=-0.03, dropouts=((1.5, 2.0), (5.0, 5.4)), imu_gaps=((3.0, 3.06), (4.2, 4.6))

@@ -5,11 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
+from bricktrack_common.rotations import rvec_from_matrix
 from bricktrack_host.fusion.clocks.rotation_fit_kernel import compare_with_gyro, integrate_attitudes
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 
 MIN_POSES = 20
 _NODE_S = 0.0025  # of the integrated gyro
+_FAR_OFF = 4.0  # medians: a wrong pose
 _KNOT_S = 0.5  # of the slow drift between integrated gyro and optics: its noise, bias and scale error
 
 
@@ -60,6 +62,26 @@ class FramesBesideGyro:
         R = np.empty((len(self._nodes_s), 3, 3))
         integrate_attitudes(self._pieces, self._nodes_s, bias_radps, R)
         return R
+
+    def mean_bias(self, offset_s: float) -> FloatArray:
+        """Return by how much more the gyro turned than the frames did, on the mean, rad/s.
+
+        Roughly; attitudes integrated without it would end up anywhere, for a chip may be off by 3 deg/s, half
+        a turn in a minute. The motion cancels, so the offset of the clocks may be rough as well.
+        """
+        t_s, R = self.frames.t_s, self.frames.R
+        inside, segment = self.covered(offset_s)
+        dt = np.diff(t_s)
+        pair = inside[:-1] & inside[1:] & (segment[:-1] == segment[1:]) & (dt < 1.5 * np.median(dt))
+        if not pair.any():
+            return np.zeros(3)
+        dt, before, after = dt[pair, None], np.flatnonzero(pair), np.flatnonzero(pair) + 1
+        seen = rvec_from_matrix(np.swapaxes(R[before], 1, 2) @ R[after])
+        felt = self.signal.angle_at(t_s[after] + offset_s) - self.signal.angle_at(t_s[before] + offset_s)
+        rate = (felt - seen) / dt
+        off = np.linalg.norm(rate - np.median(rate, axis=0), axis=1)
+        kept = off <= _FAR_OFF * np.median(off)
+        return np.asarray(np.average(rate[kept], axis=0, weights=dt[kept, 0]))
 
     def compared(
         self,

@@ -74,12 +74,10 @@ class RotationFit:
     """
 
     def __init__(self, frames: PosedFrames, signal: ImuSignal, *, skew_prior_sd: float) -> None:
-        self._frames, self._beside, self._skew_prior_sd = (
-            frames,
-            FramesBesideGyro(frames, signal),
-            skew_prior_sd,
-        )
-        self._unbiased = self._beside.integrated(np.zeros(3))  # every solution begins with it
+        self._frames, self._skew_prior_sd = frames, skew_prior_sd
+        self._beside = FramesBesideGyro(frames, signal)
+        self._start: tuple[FloatArray, FloatArray] | None = None
+        """A rough bias and the gyro integrated without it, with which every solution begins."""
 
     def solve(self, offset_s: float, *, reach_s: float = np.inf) -> Fit | None:
         """Return the fit that starts at an offset, or None where too few frames have gyro beside them.
@@ -93,7 +91,10 @@ class RotationFit:
         t, segment, inverse_sd = t_s[inside], segment[inside], 1 / sd_rad
         knot, share, n_knots = hats(t, segment)
         n, since_mid = len(t), t - 0.5 * (t_s[0] + t_s[-1])
-        gyro_bias, integrated = np.zeros(3), self._unbiased
+        if self._start is None:
+            rough = self._beside.mean_bias(offset_s)
+            self._start = rough, self._beside.integrated(rough)
+        gyro_bias, integrated = self._start
         offset, skew, sd = float(offset_s), 0.0, float("nan")
         prior_sd = np.array([np.inf, self._skew_prior_sd, LOSS_PRIOR_SD_S2, DISPERSION_PRIOR_SD_S3])
         prior = np.diag(prior_sd**-2.0)
@@ -121,7 +122,7 @@ class RotationFit:
                 return None
             if iteration == 2:
                 # A bias left in turns the axes in which the errors are compared.
-                gyro_bias, _ = self._bias(t, segment, attitude, drift, sd * sd_rad)
+                gyro_bias = gyro_bias + self._bias(t, segment, attitude, drift, sd * sd_rad)[0]
                 integrated = self._beside.integrated(gyro_bias)
             elif abs(step[0]) < _SETTLED_S and iteration > 3:
                 break
