@@ -26,8 +26,8 @@ def main() -> None:
     comparison = compare_with_truth(result, read_true_motion(truth))
     overlay = load_pictures(folder / PICTURES_NAME)[0][1]
     photo = overlay.picture
-    fused, rest, t0 = result.fused["edge"], result.rest, result.t0_ns
-    if rest is None or t0 is None:
+    fused, t0 = result.fused["edge"], result.t0_ns
+    if result.rest is None or t0 is None:
         sys.exit(f"{folder}: no rest pose or no trigger")
 
     figure = Figure(figsize=(11.5, 4.6), layout="constrained")
@@ -43,8 +43,7 @@ def main() -> None:
     motion, error = right.subplots(2, 1, sharex=True)
     seconds = (fused.t_ns - t0) / 1e9
     frames = (result.optical.t_ns - t0) / 1e9
-    moved = (fused.t_camera_brick_mm - rest.t_camera_rest_mm) @ rest.R_camera_rest
-    seen = (result.optical.t_camera_brick_mm - rest.t_camera_rest_mm) @ rest.R_camera_rest
+    moved, seen = result.from_rest["edge"].t_mm, result.from_rest["optical"].t_mm
     for i, (name, colour) in enumerate(zip("xyz", COLOURS, strict=True)):
         motion.plot(seconds, moved[:, i], color=colour, lw=1.3, label=name)
         motion.plot(frames, seen[:, i], ".", color=colour, ms=4)

@@ -109,6 +109,8 @@ class FusedTrack:
     v_camera_mmps : ndarray, shape (n, 3), mm/s, of the brick's origin LED, camera axes
     covariance : ndarray, shape (n, 6, 6), of ``[dtheta rad, dt mm]``
     flags : ndarray of int64, shape (n,), `PoseFlag`
+    with_rest : ndarray, shape (n, 6, 6), optional
+        Covariance of each pose's error with that of the mean pose at rest; `None` where it is not told.
     """
 
     t_ns: IntArray
@@ -118,6 +120,7 @@ class FusedTrack:
     v_camera_mmps: FloatArray
     covariance: FloatArray
     flags: IntArray
+    with_rest: FloatArray | None = None
 
 
 def median_frame(covariance: FloatArray) -> int:

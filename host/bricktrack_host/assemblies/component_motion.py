@@ -9,7 +9,7 @@ from bricktrack_common.arrays import IntArray
 from bricktrack_common.errors import BricktrackError
 from bricktrack_host.assemblies.motion import Motion, disagreement
 from bricktrack_host.quality import PoseFlag
-from bricktrack_host.results.rest_pose import RestPose
+from bricktrack_host.results.rest_pose import FromRest
 from bricktrack_host.results.result_store import RunResult
 from bricktrack_host.tracks import FusedTrack, OpticalTrack
 from bricktrack_host.transfer.assembly_config import AssemblyConfig, View
@@ -107,18 +107,18 @@ def assembly_motion(
         If no view of the assembly has a result.
     """
     problems: list[str] = []
-    tracks: dict[str, tuple[IntArray, FusedTrack, RestPose]] = {}
+    tracks: dict[str, tuple[IntArray, Motion]] = {}
     for view in assembly.view:
         usable = _usable(view.unit, results.get(view.unit), problems)
         if usable is not None:
-            index, track, rest = usable
-            tracks[view.unit] = index + (slips or {}).get(view.unit, 0), track, rest
+            index, motion = usable
+            tracks[view.unit] = index + (slips or {}).get(view.unit, 0), motion
     if not tracks:
         raise AssemblyError(
             f"assembly {assembly.name!r}: none of its units has a usable result: {problems[0]}"
         )
-    first = min(int(index[0]) for index, _, _ in tracks.values())
-    last = max(int(index[-1]) for index, _, _ in tracks.values())
+    first = min(int(index[0]) for index, _ in tracks.values())
+    last = max(int(index[-1]) for index, _ in tracks.values())
     sample = np.arange(first, last + 1)
     seen = {
         view.unit: _motion_of(view, sample, *tracks[view.unit])
@@ -181,9 +181,7 @@ def _from_base(
             return motions, chains
 
 
-def _usable(
-    unit: str, result: RunResult | None, problems: list[str]
-) -> tuple[IntArray, FusedTrack, RestPose] | None:
+def _usable(unit: str, result: RunResult | None, problems: list[str]) -> tuple[IntArray, Motion] | None:
     if result is None:
         problems.append(f"{unit}: no result in this test")
         return None
@@ -193,26 +191,24 @@ def _usable(
     if result.rest is None:
         problems.append(f"{unit}: no rest pose, so no displacement from rest")
         return None
-    return result.edge_index, result.fused["edge"], result.rest
+    return result.edge_index, motion_from_rest(result.from_rest["edge"], result.fused["edge"])
 
 
-def motion_from_rest(track: FusedTrack | OpticalTrack, rest: RestPose) -> Motion:
+def motion_from_rest(seen: FromRest, track: FusedTrack | OpticalTrack) -> Motion:
     """Return how the LEDs' component moved from rest, in the layout's axes at rest.
 
-    The covariance holds that of the rest pose too.
+    The covariance holds that of the rest pose too. ``seen``: the poses of the track.
     """
-    moved = rest.from_rest(track)
-    return Motion(moved.R, moved.t_mm, moved.covariance, track.flags)
+    return Motion(seen.R, seen.t_mm, seen.covariance, track.flags)
 
 
-def _motion_of(view: View, sample: IntArray, index: IntArray, track: FusedTrack, rest: RestPose) -> Motion:
+def _motion_of(view: View, sample: IntArray, index: IntArray, seen: Motion) -> Motion:
     """Return what one view saw, in brick axes; NaN at samples that it did not see."""
     n = len(sample)
     R, t_mm = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
     covariance = np.full((n, 6, 6), np.nan)
     flags = np.full(n, int(PoseFlag.NO_POSE), dtype=np.int64)
     rows = index - sample[0]
-    seen = motion_from_rest(track, rest)
     R[rows], t_mm[rows], covariance[rows], flags[rows] = seen.R, seen.t_mm, seen.covariance, seen.flags
     return Motion(R, t_mm, covariance, flags).in_axes(view.pose_brick_layout)
 

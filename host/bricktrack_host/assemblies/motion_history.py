@@ -103,7 +103,7 @@ def run_history(
         sample = result.edge_fit.sample_index_of(track.t_ns)
     else:
         sample = np.full(len(track.t_ns), np.nan)
-    motion = motion_from_rest(track, result.rest).about(point_mm)
+    motion = motion_from_rest(result.from_rest[at or "optical"], track).about(point_mm)
     sd = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
     return MotionHistory(
         name=result.manifest.unit,

@@ -82,6 +82,7 @@ def fuse_tight(
     camera_imu: CameraImu | None = None,
     camera_alignment: CameraAlignment | None = None,
     settings: FusionSettings | None = None,
+    rest_ns: tuple[int, int] | None = None,
 ) -> TightResult:
     """Return the motion of the brick from LED centroids and inertial samples together.
 
@@ -101,6 +102,8 @@ def fuse_tight(
     camera, camera_imu, camera_alignment
         Of a camera that moves, as in `bricktrack_host.fusion.estimate.fuse`.
     settings : FusionSettings, optional
+    rest_ns : (int, int), camera time, optional
+        When the brick rested: then the track says what it shares with the pose there.
 
     Raises
     ------
@@ -118,7 +121,7 @@ def fuse_tight(
     pose_level = fused_result(item, first, settings)
     smoother = LedSmoother(
         SeenLeds.of(observations, ray_model), first, ray_model, brick_model,
-        lever_arm_m=np.asarray(lever_arm_mm, dtype=np.float64) * 1e-3, settings=settings,
+        lever_arm_m=np.asarray(lever_arm_mm, dtype=np.float64) * 1e-3, settings=settings, rest_ns=rest_ns,
     )  # fmt: skip
     del first  # memory holds one smoother
     done = smoother.smooth()
@@ -139,7 +142,7 @@ def tight_result(
     track = sample_motion(
         smoothed.run, smoothed.nodes, smoothed.problem, smoothed.estimate, 0,
         output_t_ns=item.output_t_ns, seen_cam_s=seconds_since(seen_ns, smoothed.run.signal.epoch_ns),
-        common=np.zeros((6, 6)), settings=settings, is_smoothed=True,
+        common=np.zeros((6, 6)), settings=settings, is_smoothed=True, with_rest=done.with_rest,
     )  # fmt: skip
     shape = observations.uv_px.shape[:2]
     chi2_of_led, rejected = np.full(shape, np.nan), np.zeros(shape, dtype=np.bool_)

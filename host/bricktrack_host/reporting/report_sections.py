@@ -112,7 +112,8 @@ def _motion_section(result: RunResult, figures: KeyFigures) -> Section:
         source = "given" if result.rest.source == "given" else "found by stillness"
         words = (
             "Displacement of the first LED, and rotation vector, from rest, in the brick's axes at rest. "
-            f"The rest pose is the mean of {result.rest.n_frames} frames over {seconds:.2f} s ({source})."
+            f"The rest pose is the mean of {result.rest.n_frames} frames over {seconds:.2f} s ({source})"
+            + (", of the fused motion its own mean there." if result.fused_rest is not None else ".")
         )
     else:
         words = "No rest pose: position of the first LED and rotation vector in the camera frame."

@@ -12,6 +12,7 @@ import scipy.io
 
 from bricktrack_common.errors import RunFormatError
 from bricktrack_host.durable_files import written_whole
+from bricktrack_host.results.table_columns import COVARIANCES
 from bricktrack_host.results.table_files import read_parquet
 
 Format = Literal["csv", "mat", "parquet"]
@@ -67,7 +68,7 @@ def write_table(table: "pa.Table", path: Path, form: Format) -> None:
 
 
 def _write_csv(table: "pa.Table", path: Path) -> None:
-    flat = table.drop_columns(["covariance"]) if "covariance" in table.column_names else table
+    flat = table.drop_columns([name for name in COVARIANCES if name in table.column_names])
     pa.csv.write_csv(flat, path, pa.csv.WriteOptions(quoting_style="needed"))
 
 

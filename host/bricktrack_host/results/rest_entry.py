@@ -29,11 +29,12 @@ class RestEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     spread_mm: list[float]
     spread_rad: list[float]
     source: Literal["found", "given"]
+    covariance: list[list[float]] | None = None
     ray_errors: RayErrorsEntry | None = None
 
 
-def rest_entry(rest: RestPose | None) -> RestEntry | None:
-    """Return what is written of a rest pose."""
+def rest_entry(rest: RestPose | None, *, with_rays: bool = True) -> RestEntry | None:
+    """Return what is written of a rest pose; what rays do is long, and said once."""
     if rest is None:
         return None
     return RestEntry(
@@ -44,7 +45,8 @@ def rest_entry(rest: RestPose | None) -> RestEntry | None:
         spread_mm=rest.spread_mm.tolist(),
         spread_rad=rest.spread_rad.tolist(),
         source=rest.source,
-        ray_errors=None if rest.ray_errors is None else _ray_errors_entry(rest.ray_errors),
+        covariance=rest.covariance.tolist(),
+        ray_errors=_ray_errors_entry(rest.ray_errors) if with_rays and rest.ray_errors else None,
     )
 
 
@@ -57,10 +59,13 @@ def _ray_errors_entry(errors: RayErrors) -> RayErrorsEntry:
     )
 
 
-def rest_pose_of(entry: RestEntry | None) -> RestPose | None:
-    """Return the rest pose that was written."""
+def rest_pose_of(entry: RestEntry | None, *, rays_of: RestPose | None = None) -> RestPose | None:
+    """Return the rest pose that was written, with what another one says of the rays if it does not."""
     if entry is None:
         return None
+    errors = None if rays_of is None else rays_of.ray_errors
+    # Until version 2 each frame was believed to err anew.
+    of_mean = np.square([*entry.spread_rad, *entry.spread_mm]) / entry.n_frames
     return RestPose(
         R_camera_rest=np.array(entry.rotation_camera_rest),
         t_camera_rest_mm=np.array(entry.position_camera_mm),
@@ -68,8 +73,9 @@ def rest_pose_of(entry: RestEntry | None) -> RestPose | None:
         n_frames=entry.n_frames,
         spread_mm=np.array(entry.spread_mm),
         spread_rad=np.array(entry.spread_rad),
+        covariance=np.diag(of_mean) if entry.covariance is None else np.array(entry.covariance),
         source=entry.source,
-        ray_errors=None if entry.ray_errors is None else _ray_errors(entry.ray_errors),
+        ray_errors=_ray_errors(entry.ray_errors) if entry.ray_errors else errors,
     )
 
 

@@ -1,7 +1,7 @@
 """The rest pose: where the brick stood while nothing moved, from which displacements are counted (tare)."""
 
 from bisect import insort
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import dist
 from typing import Literal
 
@@ -56,6 +56,8 @@ class RestPose:
         Frames that the mean is of.
     spread_mm, spread_rad : ndarray, shape (3,)
         Standard deviation of single frames about the mean: position in camera axes, rotation in brick axes.
+    covariance : ndarray, shape (6, 6)
+        Of the error ``[dtheta rad, dt mm]`` of the mean, as far as poses seen from it do not share it.
     source : "found" or "given"
         Whether the interval was found by stillness or told.
     ray_errors : RayErrors or None
@@ -68,13 +70,18 @@ class RestPose:
     n_frames: int
     spread_mm: FloatArray
     spread_rad: FloatArray
+    covariance: FloatArray
     source: Literal["found", "given"]
     ray_errors: RayErrors | None = None
 
-    def from_rest(self, track: OpticalTrack | FusedTrack) -> FromRest:
-        """Return the poses of a track as seen from this one, with their covariance."""
+    def from_rest(
+        self, track: OpticalTrack | FusedTrack, *, covariance: FloatArray | None = None
+    ) -> FromRest:
+        """Return the poses of a track as seen from this one; their covariance is worked out if not known."""
         R, t_mm = track.R_camera_brick, track.t_camera_brick_mm
-        covariance = self.relative_covariance(R, t_mm, track.covariance)
+        if covariance is None:
+            with_rest = track.with_rest if isinstance(track, FusedTrack) else None
+            covariance = self.relative_covariance(R, t_mm, track.covariance, with_rest=with_rest)
         return FromRest(*self._seen_from_rest(R, t_mm), covariance)
 
     def relative(self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray) -> Pose:
@@ -94,13 +101,18 @@ class RestPose:
         return R_rest_camera @ R_camera_brick, (t_camera_brick_mm - self.t_camera_rest_mm) @ R_rest_camera.T
 
     def relative_covariance(
-        self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray, covariance: FloatArray
+        self,
+        R_camera_brick: FloatArray,
+        t_camera_brick_mm: FloatArray,
+        covariance: FloatArray,
+        *,
+        with_rest: FloatArray | None = None,
     ) -> FloatArray:
         """Return the covariance, shape (n, 6, 6), of poses seen from rest: theirs and the mean's there.
 
-        What the calibration's rays do to both alike drops out; what differs stays. All are of
-        ``[dtheta rad, dt mm]``. With ``D = X_rest^-1 X``: dtheta = dtheta_X - R_D' dtheta_rest and
-        dt = R_rest' (dt_X - dt_rest) + [t_D]x dtheta_rest.
+        What both share drops out, and so does what the calibration's rays do to both alike; what differs
+        stays. All are of ``[dtheta rad, dt mm]``. With ``D = X_rest^-1 X``:
+        dtheta = dtheta_X - R_D' dtheta_rest and dt = R_rest' (dt_X - dt_rest) + [t_D]x dtheta_rest.
 
         Parameters
         ----------
@@ -108,32 +120,65 @@ class RestPose:
         t_camera_brick_mm : ndarray, shape (n, 3), mm
         covariance : ndarray, shape (n, 6, 6)
             Of these poses in the camera frame.
+        with_rest : ndarray, shape (n, 6, 6), optional
+            Of their errors with that of the mean at rest; none: nothing is shared.
         """
         total = np.empty((len(covariance), 6, 6))
         for start in range(0, len(total), _AT_ONCE):
             now = slice(start, start + _AT_ONCE)
-            total[now] = self._covariance_of(R_camera_brick[now], t_camera_brick_mm[now], covariance[now])
+            shared = np.zeros((6, 6)) if with_rest is None else with_rest[now]
+            total[now] = self._covariance_of(
+                R_camera_brick[now], t_camera_brick_mm[now], covariance[now], shared
+            )
         return total
 
     def _covariance_of(
-        self, R_camera_brick: FloatArray, t_camera_brick_mm: FloatArray, covariance: FloatArray
+        self,
+        R_camera_brick: FloatArray,
+        t_camera_brick_mm: FloatArray,
+        covariance: FloatArray,
+        with_rest: FloatArray,
     ) -> FloatArray:
-        """Return the same as `relative_covariance` of not too many poses: it takes 1 kB for each."""
+        """Return the same as `relative_covariance` of not too many poses: it takes 2 kB for each."""
         turned, moved_mm = self._seen_from_rest(R_camera_brick, t_camera_brick_mm)
-        R_rest_camera = self.R_camera_rest.T
-        of_turn = np.concatenate([-np.swapaxes(turned, 1, 2), skew(moved_mm)], axis=1)
-        of_turn *= self.spread_rad / np.sqrt(self.n_frames)
-        of_shift = R_rest_camera * self.spread_mm / np.sqrt(self.n_frames)
-        total = of_turn @ np.swapaxes(of_turn, 1, 2)
-        total[:, 3:, 3:] += of_shift @ of_shift.T
-        of_pose = np.zeros((6, 6))
-        of_pose[:3, :3], of_pose[3:, 3:] = np.eye(3), R_rest_camera
+        of_pose, of_rest = np.zeros((6, 6)), np.zeros((len(turned), 6, 6))
+        of_pose[:3, :3], of_pose[3:, 3:] = np.eye(3), self.R_camera_rest.T
+        of_rest[:, :3, :3], of_rest[:, 3:, :3] = -np.swapaxes(turned, 1, 2), skew(moved_mm)
+        of_rest[:, 3:, 3:] = -self.R_camera_rest.T
         # Of all rows at once: products of six by six one by one take three times as long.
+        half = (of_rest.reshape(-1, 6) @ (0.5 * self.covariance)).reshape(-1, 6, 6) + of_pose @ with_rest
+        total = half @ np.swapaxes(of_rest, 1, 2)
+        total += np.swapaxes(total, 1, 2).copy()
         half = np.swapaxes((covariance.reshape(-1, 6) @ of_pose.T).reshape(-1, 6, 6), 1, 2)
         total += (half.reshape(-1, 6) @ of_pose.T).reshape(-1, 6, 6)
         if self.ray_errors is not None:
             total += self.ray_errors.change_from_there(R_camera_brick, t_camera_brick_mm)
         return np.asarray(total)
+
+
+def rest_of_fused(rest: RestPose, frames: FusedTrack, optical: OpticalTrack) -> RestPose:
+    """Return the rest pose of a motion that takes out errors which the optical poses keep: its own mean.
+
+    Where it does not reach the rest it is counted from the optical rest pose, as unsure as one optical pose.
+    All covariances are still without what the calibration's rays do, which is not for each pose by itself.
+
+    Parameters
+    ----------
+    rest : RestPose
+        Of the optical poses.
+    frames : FusedTrack
+        The motion at the instants of the optical poses.
+    optical : OpticalTrack
+    """
+    t_mm, first, last = frames.t_camera_brick_mm, *rest.interval_ns
+    inside = (frames.t_ns >= first) & (frames.t_ns <= last)
+    known = np.flatnonzero(inside & np.isfinite(t_mm).all(axis=1))
+    if frames.with_rest is None or len(known) < MIN_FRAMES:
+        at_rest = (optical.t_ns >= first) & (optical.t_ns <= last)
+        of_one = np.nanmean(optical.covariance[at_rest], axis=0)
+        return replace(rest, covariance=rest.covariance + of_one)
+    own = _mean_pose(frames, known, rest.source)
+    return replace(own, covariance=own.covariance + frames.covariance[known].mean(axis=0))
 
 
 def tare(
@@ -246,10 +291,15 @@ def _inertial_onset_ns(imu: ImuTrack, frames_ns: IntArray) -> int | None:
     return int(imu.t_ns[begins[0]]) if begins.size else None
 
 
-def _mean_pose(optical: OpticalTrack, frames: IntArray, source: Literal["found", "given"]) -> RestPose:
-    """Return the mean of poses, without those beyond five robust deviations of the median."""
-    t_mm = optical.t_camera_brick_mm[frames]
-    R = optical.R_camera_brick[frames]
+def _mean_pose(
+    track: OpticalTrack | FusedTrack, frames: IntArray, source: Literal["found", "given"]
+) -> RestPose:
+    """Return the mean of poses, without those beyond five robust deviations of the median.
+
+    How unsure it is the means of each quarter of the time say: a brick that creeps has no one rest pose.
+    """
+    t_mm = track.t_camera_brick_mm[frames]
+    R = track.R_camera_brick[frames]
     R_start = R[len(R) // 2]
     turns_rad = rvec_from_matrix(R_start.T @ R)
     keep = np.ones(len(frames), dtype=np.bool_)
@@ -260,13 +310,16 @@ def _mean_pose(optical: OpticalTrack, frames: IntArray, source: Literal["found",
         keep[:] = True
     used = frames[keep]
     mean_turn_rad = turns_rad[keep].mean(axis=0)
+    quarters = np.array_split(np.concatenate([turns_rad[keep], t_mm[keep]], axis=1), 4)
+    variance = np.var([quarter.mean(axis=0) for quarter in quarters], axis=0, ddof=1)
     return RestPose(
         R_camera_rest=R_start @ matrix_from_rvec(mean_turn_rad),
         t_camera_rest_mm=t_mm[keep].mean(axis=0),
-        interval_ns=(int(optical.t_ns[used[0]]), int(optical.t_ns[used[-1]])),
+        interval_ns=(int(track.t_ns[used[0]]), int(track.t_ns[used[-1]])),
         n_frames=int(used.size),
         spread_mm=t_mm[keep].std(axis=0, ddof=1),
         spread_rad=turns_rad[keep].std(axis=0, ddof=1),
+        covariance=np.diag(variance),
         source=source,
     )
 

@@ -7,7 +7,7 @@ processed again gives the same bytes.
 import hashlib
 import importlib.metadata
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bricktrack_common.arrays import IntArray
+from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_common.checksums import sha256_file
 from bricktrack_common.errors import RunFormatError
 from bricktrack_common.run_manifest import MANIFEST_NAME, RunManifest
@@ -43,7 +43,7 @@ from bricktrack_host.results.tables_to_tracks import (
 from bricktrack_host.tracks import FusedTrack, ImuTrack, LedObservations, OpticalTrack
 
 RESULTS_SCHEMA = "bricktrack.results"
-RESULTS_VERSION = 2
+RESULTS_VERSION = 3
 RESULTS_FOLDER = "results"
 SUMMARY_NAME = "summary.json"
 REPORT_NAME = "report.html"
@@ -96,7 +96,11 @@ class RunResult:
     imu_camera_t_ns : ndarray of int64, shape (n,), or None
         When each of those samples was taken, on the camera's time; `None` where the clocks were not aligned.
     rest : RestPose or None
-        `None`: nothing was quiet; displacements from rest are NaN.
+        Of the optical poses. `None`: nothing was quiet; displacements from rest are NaN.
+    fused_rest : RestPose or None
+        From which the fused motion is counted; `None`: from `rest`.
+    moved_covariance : dict
+        Of the fused motion from rest, (n, 6, 6) for each kind, where it was read; else it is worked out.
     alignment : dict
         What the time alignment found, as ``offset_ms``, ``offset_sd_ms``, ``skew_ppm``, ``method``.
     calibration : dict
@@ -122,6 +126,8 @@ class RunResult:
     provenance: Provenance
     timings_s: dict[str, float] = field(default_factory=dict)
     imu_camera_t_ns: IntArray | None = None
+    fused_rest: RestPose | None = None
+    moved_covariance: dict[FusedKind, FloatArray] = field(default_factory=dict)
 
     @property
     def t0_ns(self) -> int | None:
@@ -132,13 +138,13 @@ class RunResult:
     def from_rest(self) -> dict[str, FromRest]:
         """The poses as seen from rest: ``"optical"`` and each kind of `fused`; empty without a rest pose.
 
-        Worked out once, for tables, page and comparison with the truth.
+        Worked out once, for all who show it.
         """
         if self.rest is None:
             return {}
-        seen = {"optical": self.rest.from_rest(self.optical)}
+        seen, rest = {"optical": self.rest.from_rest(self.optical)}, self.fused_rest or self.rest
         for kind, track in self.fused.items():
-            seen[kind] = self.rest.from_rest(track)
+            seen[kind] = rest.from_rest(track, covariance=self.moved_covariance.get(kind))
         return seen
 
 
@@ -153,6 +159,7 @@ class _Summary(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     conventions: dict[str, str]
     tables: dict[str, int]
     rest_pose: RestEntry | None
+    fused_rest_pose: RestEntry | None = None
     square_wave: Details | None
     alignment: Details
     calibration: Details
@@ -238,21 +245,18 @@ def _write_files(result: RunResult, folder: Path) -> None:
         n_rows[name] = table.num_rows
 
     # One after the other: a long run's are as large as all that they are made of.
-    optical = optical_table(
+    write("optical", optical_table(
         result.optical, result.observations, t0_ns=t0_ns, from_rest=result.from_rest.get("optical"),
         edge_fit=result.edge_fit, metadata=metadata,
-    )  # fmt: skip
-    write("optical", optical)
-    del optical
-    fused = fused_table(
-        result.fused, edge_index=result.edge_index, t0_ns=t0_ns, rest=result.rest, from_rest=result.from_rest,
-        edge_fit=result.edge_fit, metadata=metadata,
-    )  # fmt: skip
-    write("fused", fused)
-    del fused
-    leds = leds_table(result.observations, result.optical, result.led_names, t0_ns=t0_ns, metadata=metadata)
-    write("leds", leds)
-    del leds
+    ))  # fmt: skip
+    write("fused", fused_table(
+        result.fused, edge_index=result.edge_index, t0_ns=t0_ns, rest=result.fused_rest or result.rest,
+        from_rest=result.from_rest, edge_fit=result.edge_fit, metadata=metadata,
+    ))  # fmt: skip
+    write(
+        "leds",
+        leds_table(result.observations, result.optical, result.led_names, t0_ns=t0_ns, metadata=metadata),
+    )
     if result.imu is not None:
         write("imu", imu_table(result.imu, result.imu_camera_t_ns, t0_ns=t0_ns, metadata=metadata))
     if result.edge_fit is not None:
@@ -266,6 +270,7 @@ def _write_files(result: RunResult, folder: Path) -> None:
         conventions=CONVENTIONS,
         tables=n_rows,
         rest_pose=rest_entry(result.rest),
+        fused_rest_pose=rest_entry(result.fused_rest, with_rays=False),
         square_wave=_square_wave(result.edge_fit),
         alignment=result.alignment,
         calibration=result.calibration,
@@ -302,7 +307,8 @@ def read_result(folder: Path) -> RunResult:
         if name not in tables:
             raise RunFormatError(f"{folder / SUMMARY_NAME}: tables: no '{name}'")
     optical, observations = optical_from_tables(tables["optical"], tables["leds"], len(summary.led_names))
-    fused, edge_index = fused_from_table(tables["fused"])
+    fused, moved_covariance, edge_index = fused_from_table(tables["fused"])
+    rest = rest_pose_of(summary.rest_pose)
     imu = imu_camera_t_ns = None
     if "imu" in tables:
         imu_camera_t_ns = imu_camera_times(tables["imu"])
@@ -324,7 +330,9 @@ def read_result(folder: Path) -> RunResult:
         edge_fit=edge_fit,
         imu=imu,
         imu_camera_t_ns=imu_camera_t_ns,
-        rest=rest_pose_of(summary.rest_pose),
+        rest=rest,
+        fused_rest=rest_pose_of(summary.fused_rest_pose, rays_of=rest),
+        moved_covariance=moved_covariance,
         alignment=summary.alignment,
         calibration=summary.calibration,
         problems=tuple(summary.problems),
@@ -358,7 +366,6 @@ def _read_summary(folder: Path) -> _Summary:
 
 
 def _table_metadata(result: RunResult) -> dict[str, str]:
-    rest = None if result.rest is None else replace(result.rest, ray_errors=None)  # long, and in the summary
     metadata = {f"bricktrack.{name.replace(' ', '_')}": words for name, words in CONVENTIONS.items()}
     metadata |= {
         "bricktrack.schema": RESULTS_SCHEMA,
@@ -367,7 +374,7 @@ def _table_metadata(result: RunResult) -> dict[str, str]:
         "bricktrack.unit": result.manifest.unit,
         "bricktrack.simulated": "true" if result.manifest.simulated else "false",
         "bricktrack.trigger_ns": "none" if result.t0_ns is None else str(result.t0_ns),
-        "bricktrack.rest_pose": msgspec.json.encode(rest_entry(rest)).decode(),
+        "bricktrack.rest_pose": msgspec.json.encode(rest_entry(result.rest, with_rays=False)).decode(),
         "bricktrack.provenance": msgspec.json.encode(result.provenance).decode(),
     }
     return metadata

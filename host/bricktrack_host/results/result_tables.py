@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -53,7 +53,7 @@ def optical_table(
          pa.array(np.arange(len(optical.t_ns)))),
         *_time_columns(optical.t_ns, t0_ns, edge_fit),
         *_pose_columns(optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance,
-                       None if from_rest is None else _Moved.of(from_rest)),
+                       from_rest),
         (Column("n_leds", "1", "LEDs that the pose is of"), pa.array(n_used)),
         (Column("residual_rms_px", "px", "root of the mean squared distance, seen less predicted"),
          pa.array(rms_px)),
@@ -103,8 +103,13 @@ def fused_table(
     is_edge = (number >= 0)[order]
     omega = in_order([track.omega_brick_radps for track in tracks])
     v_mmps = in_order([track.v_camera_mmps for track in tracks])
-    moved = [_Moved.of(from_rest[kind]) for kind in kinds if kind in from_rest]
-    seen = _Moved(*(in_order(parts) for parts in zip(*moved, strict=True))) if moved else None
+    moved = [from_rest[kind] for kind in kinds if kind in from_rest]
+    seen = None
+    if moved:
+        seen = FromRest(
+            in_order([m.R for m in moved]), in_order([m.t_mm for m in moved]),
+            in_order([m.covariance for m in moved]),
+        )  # fmt: skip
     columns: Columns = [
         (Column("kind", "", "what fixes the instant: imu (slot), frame (picture) or edge (square wave)"),
          pa.array([kinds[k] for k in kind_of[order]], type=pa.string())),
@@ -208,30 +213,18 @@ def _time_columns(t_ns: IntArray, t0_ns: int | None, edge_fit: EdgeFit | None) -
     ]  # fmt: skip
 
 
-class _Moved(NamedTuple):
-    """Poses as seen from rest, shape (n, 3, 3) and (n, 3), with the sd of rotation, rad, and position, mm."""
-
-    R: FloatArray
-    t_mm: FloatArray
-    sd: FloatArray
-
-    @classmethod
-    def of(cls, seen: FromRest) -> "_Moved":
-        return cls(seen.R, seen.t_mm, _sd(seen.covariance))
-
-
 def _sd(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
 
 
 def _pose_columns(
-    R: FloatArray, t_mm: FloatArray, covariance: FloatArray, from_rest: _Moved | None
+    R: FloatArray, t_mm: FloatArray, covariance: FloatArray, from_rest: FromRest | None
 ) -> Columns:
     q = continuous_quaternions(quaternion_from_matrix(R))
     sd = _sd(covariance)
     if from_rest is None:
-        from_rest = _Moved(*(np.full_like(values, np.nan) for values in (R, t_mm, sd)))
-    d_sd = from_rest.sd
+        from_rest = FromRest(*(np.full_like(values, np.nan) for values in (R, t_mm, covariance)))
+    d_sd = _sd(from_rest.covariance)
     return [
         *vector_columns("{}_mm", "mm", "position of the first LED, camera frame", t_mm),
         *(
@@ -269,6 +262,7 @@ def _pose_columns(
             np.rad2deg(d_sd[:, :3]),
         ),
         covariance_column(covariance),
+        covariance_column(from_rest.covariance, name="dcovariance"),
     ]
 
 

@@ -95,18 +95,16 @@ def key_figures(result: RunResult) -> KeyFigures:
     has_pose = np.asarray(np.isfinite(optical.t_camera_brick_mm).all(axis=1))
     track = main_track(result)
     if track is None:
-        R, t_mm, covariance = optical.R_camera_brick, optical.t_camera_brick_mm, optical.covariance
+        inside, covariance = np.ones(len(optical.t_ns), dtype=np.bool_), optical.covariance
         speed = np.empty(0)
     else:
         inside = track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) == 0
-        R, t_mm = track.R_camera_brick[inside], track.t_camera_brick_mm[inside]
         covariance = track.covariance[inside]
         speed = np.linalg.norm(track.v_camera_mmps[inside], axis=1)
     peak_mm = peak_deg = np.full(3, np.nan)
-    if result.rest is not None:
-        moved = result.rest.relative(R, t_mm)
-        peak_mm = _largest(moved.t_mm)
-        peak_deg = _largest(np.rad2deg(rvec_from_matrix(moved.R)))
+    if (moved := result.from_rest.get(main_kind(result) or "optical")) is not None:
+        peak_mm = _largest(moved.t_mm[inside])
+        peak_deg = _largest(np.rad2deg(rvec_from_matrix(moved.R[inside])))
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     median_sd = (
         np.median(sd[np.isfinite(sd).all(axis=1)], axis=0) if np.isfinite(sd).any() else np.full(6, np.nan)

@@ -11,6 +11,8 @@ from bricktrack_common.imu_records import ImuFlag
 from bricktrack_host.quality import LedFlag, PoseFlag
 
 XYZ = "xyz"
+COVARIANCES = "covariance", "dcovariance"
+"""Columns of lists, which no CSV holds."""
 TRIANGLE = np.triu_indices(6)
 """Rows and columns of a covariance that are written."""
 
@@ -18,12 +20,14 @@ CONVENTIONS = {
     "time": "t_ns is CLOCK_MONOTONIC of the unit, int64 ns; t_s counts from the first rising edge, in s",
     "camera frame": "origin at the projection centre, x right (u), y down (v), z out through the lens, mm",
     "brick frame": "origin at the first LED of the layout, axes as in the drawing, mm",
-    "rest frame": "the brick frame where it stood before the shake; columns in d are seen from it",
+    "rest frame": "the brick frame where it stood before the shake; columns in d are seen from it, as the "
+    "mean of the same kind of poses has it, optical or fused",
     "quaternion": "order w, x, y, z; takes brick to camera coordinates; the sign is chosen to be continuous",
     "rotation vector": "axis times angle, rad, of the rotation that takes brick to camera coordinates",
     "angles": "intrinsic XYZ, degrees: R = Rx(angle_x) @ Ry(angle_y) @ Rz(angle_z)",
     "covariance": "upper triangle, row by row, of the 6 x 6 covariance of [dtheta rad, dt mm]: "
-    "R_true = R Exp(dtheta), brick axes; t_true = t + dt, camera axes",
+    "R_true = R Exp(dtheta), brick axes; t_true = t + dt, camera axes; dcovariance: of the motion from rest, "
+    "brick axes at rest",
     "missing": "NaN, with a bit in flags that says why",
 }
 
@@ -49,11 +53,11 @@ def make_table(columns: Columns, metadata: dict[str, str]) -> "pa.Table":
     return pa.Table.from_arrays([array for _, array in columns], schema=pa.schema(fields, metadata=keys))
 
 
-def covariance_column(covariance: FloatArray) -> tuple[Column, "pa.Array[Any]"]:
+def covariance_column(covariance: FloatArray, *, name: str = "covariance") -> tuple[Column, "pa.Array[Any]"]:
     """Return the upper triangles of covariances, shape (n, 6, 6), as one column of lists."""
     triangle = np.ascontiguousarray(covariance[:, TRIANGLE[0], TRIANGLE[1]])
     packed = pa.FixedSizeListArray.from_arrays(pa.array(triangle.reshape(-1)), 21)
-    return Column("covariance", "rad, mm", "see the table's conventions; left out of the CSV"), packed
+    return Column(name, "rad, mm", "see the table's conventions; left out of the CSV"), packed
 
 
 def vector_columns(name: str, unit: str, meaning: str, values: FloatArray) -> Columns:

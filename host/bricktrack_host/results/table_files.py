@@ -7,6 +7,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from bricktrack_common.errors import RunFormatError
+from bricktrack_host.results.table_columns import COVARIANCES
 
 _ROWS_OF_GROUP = 1 << 16
 """Of a Parquet file, which is packed group by group: so many rows are some 20 MB."""
@@ -25,7 +26,7 @@ def write_table(table: "pa.Table", folder: Path, name: str) -> None:
         table, path, compression="zstd", row_group_size=_ROWS_OF_GROUP,
         use_dictionary=repeats,  # type: ignore[arg-type]
     )  # fmt: skip
-    flat = table.drop_columns(["covariance"]) if "covariance" in table.column_names else table
+    flat = table.drop_columns([name for name in COVARIANCES if name in table.column_names])
     how = pa.csv.WriteOptions(quoting_style="needed", batch_size=_ROWS_AT_ONCE)
     pa.csv.write_csv(flat, folder / f"{name}.csv", how)
 

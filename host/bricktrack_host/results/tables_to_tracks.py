@@ -29,7 +29,7 @@ def optical_from_tables(
         t_ns=_ints(optical, "t_ns"),
         R_camera_brick=_rotations(optical),
         t_camera_brick_mm=_vectors(optical, "{}_mm"),
-        covariance=_covariances(optical),
+        covariance=_covariances(optical, "covariance"),
         flags=_ints(optical, "flags"),
         residual_px=residual.reshape(n, n_leds, 2),
         led_t_ns=_ints(leds, "t_ns").reshape(n, n_leds),
@@ -46,11 +46,18 @@ def optical_from_tables(
     return track, observations
 
 
-def fused_from_table(table: "pa.Table") -> tuple[dict[FusedKind, FusedTrack], IntArray]:
-    """Return the fused tracks by kind, and the numbers of the edges."""
+def fused_from_table(
+    table: "pa.Table",
+) -> tuple[dict[FusedKind, FusedTrack], dict[FusedKind, FloatArray], IntArray]:
+    """Return the fused tracks and the covariances of their motion from rest by kind, and the edges' numbers.
+
+    Version 2 of the results holds no such covariances.
+    """
     kind = np.array(table.column("kind").to_pylist(), dtype=object)
-    R, covariance = _rotations(table), _covariances(table)
+    R, covariance = _rotations(table), _covariances(table, "covariance")
+    moved = _covariances(table, "dcovariance") if "dcovariance" in table.column_names else None
     fused: dict[FusedKind, FusedTrack] = {}
+    from_rest: dict[FusedKind, FloatArray] = {}
     number = np.empty(0, dtype=np.int64)
     for name in FUSED_KINDS:
         rows = np.flatnonzero(kind == name)
@@ -65,10 +72,12 @@ def fused_from_table(table: "pa.Table") -> tuple[dict[FusedKind, FusedTrack], In
             covariance=covariance[rows],
             flags=_ints(table, "flags")[rows],
         )
+        if moved is not None:
+            from_rest[name] = moved[rows]
         if name == "edge":
             numbers = table.column("edge_index").to_pylist()
             number = np.array([numbers[i] for i in rows], dtype=np.int64)
-    return fused, number
+    return fused, from_rest, number
 
 
 def imu_from_table(table: "pa.Table", acc_range_mps2: float) -> ImuTrack:
@@ -109,8 +118,8 @@ def _rotations(table: "pa.Table") -> FloatArray:
     return matrix_from_quaternion(np.stack([_floats(table, f"q_{c}") for c in "wxyz"], axis=1))
 
 
-def _covariances(table: "pa.Table") -> FloatArray:
-    column: Any = table.column("covariance").combine_chunks()
+def _covariances(table: "pa.Table", name: str) -> FloatArray:
+    column: Any = table.column(name).combine_chunks()
     triangle = np.asarray(column.flatten().to_numpy(zero_copy_only=False)).reshape(-1, 21)
     covariance = np.empty((len(triangle), 6, 6))
     covariance[:, TRIANGLE[0], TRIANGLE[1]] = triangle

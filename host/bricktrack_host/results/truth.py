@@ -11,7 +11,7 @@ from scipy.special import chdtri
 
 from bricktrack_common.arrays import BoolArray, FloatArray, IntArray, rows_of
 from bricktrack_common.errors import TrackingError
-from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.normalised_errors import normalised_squares
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.rest_pose import FromRest
@@ -137,12 +137,7 @@ def compare_with_truth(result: RunResult, truth: TrueMotion) -> TruthComparison:
     groups: list[GroupErrors] = []
     from_rest: list[GroupErrors] = []
     series: dict[Source, ErrorSeries] = {}
-    true_rest = None
-    if result.rest is not None:
-        middle = np.array([sum(result.rest.interval_ns) // 2], dtype=np.int64)
-        R_rest, t_rest_mm = truth.at(_snap(middle, result.optical.t_ns) - shift_ns)
-        if np.isfinite(t_rest_mm).all():
-            true_rest = R_rest[0], t_rest_mm[0]
+    true_rest = _true_rest(result, truth, shift_ns)
 
     def compare(source: Source, tracks: dict[str, OpticalTrack | FusedTrack], shown: str) -> None:
         true = {kind: truth.at(track.t_ns - shift_ns) for kind, track in tracks.items()}
@@ -281,9 +276,17 @@ def _impacts(truth: TrueMotion) -> IntArray:
     return np.array(found, dtype=np.int64)
 
 
-def _snap(t_ns: IntArray, frames_ns: IntArray) -> IntArray:
-    """Return the frame instants nearest to times: truths of single frames have no other."""
-    return np.asarray(frames_ns[np.abs(frames_ns[None, :] - t_ns[:, None]).argmin(axis=1)])
+def _true_rest(result: RunResult, truth: TrueMotion, shift_ns: int) -> tuple[FloatArray, FloatArray] | None:
+    """Return the mean of the true poses of the frames at rest, as the rest pose is one; or `None`."""
+    if result.rest is None:
+        return None
+    (first, last), frames_ns = result.rest.interval_ns, result.optical.t_ns
+    R, t_mm = truth.at(frames_ns[(frames_ns >= first) & (frames_ns <= last)] - shift_ns)
+    known = _known(t_mm)
+    if not known.any():
+        return None
+    R, start = R[known], R[known][0]
+    return start @ matrix_from_rvec(rvec_from_matrix(start.T @ R).mean(axis=0)), t_mm[known].mean(axis=0)
 
 
 def groups_to_show(groups: list[GroupErrors]) -> list[GroupErrors]:

@@ -182,8 +182,11 @@ def fuse_run(
     problems: list[str],
     *,
     seen: tuple[LedObservations, RayModel] | None,
+    rest_ns: tuple[int, int] | None = None,
 ) -> tuple[dict[FusedKind, FusedTrack], FusionResult | None, BoolArray | None]:
     """Return the motion at the instants wanted: LED by LED where ``seen`` is given, else pose by pose.
+
+    ``rest_ns``: when the brick rested, camera time.
 
     Returns
     -------
@@ -202,8 +205,9 @@ def fuse_run(
                 fusion = by_poses = _by_poses(optical, inertial, lever_arm_mm, wanted)
             else:
                 tight = _fuse_tight(
-                    optical, inertial, brick, seen, wanted, problems, lever_arm_mm=lever_arm_mm
-                )
+                    optical, inertial, brick, seen, wanted, problems, lever_arm_mm=lever_arm_mm,
+                    rest_ns=rest_ns,
+                )  # fmt: skip
                 fusion, by_poses, rejected = tight.fused, tight.pose_level, tight.led_rejected
         except (ShapeError, TrackingError) as e:
             problems.append(f"fusion was not possible, optical poses alone: {e}")
@@ -245,13 +249,14 @@ def _fuse_tight(
     problems: list[str],
     *,
     lever_arm_mm: FloatArray,
+    rest_ns: tuple[int, int] | None,
 ) -> TightResult:
     observations, rays = seen
     tight = fuse_tight(
         observations, optical, inertial.imu, rays, brick,
         lever_arm_mm=lever_arm_mm, output_t_ns=wanted, alignment=inertial.alignment,
         camera="static" if inertial.camera is None else inertial.camera.kind,
-        camera_imu=inertial.camera, camera_alignment=inertial.camera_alignment,
+        camera_imu=inertial.camera, camera_alignment=inertial.camera_alignment, rest_ns=rest_ns,
     )  # fmt: skip
     problems.extend(words_on_rejected(tight.led_rejected, np.isfinite(tight.led_chi2)))
     problems.extend(words_on_led_offsets(tight.led_offset_sd_px))

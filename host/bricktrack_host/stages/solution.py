@@ -16,7 +16,7 @@ from bricktrack_host.calibration.calibration_file import Calibration
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.reporting.fusion_check import TwoFusions
 from bricktrack_host.results.ray_errors import ray_errors
-from bricktrack_host.results.rest_pose import RestPose
+from bricktrack_host.results.rest_pose import RestPose, rest_of_fused
 from bricktrack_host.results.result_store import Provenance, RunResult, software_version
 from bricktrack_host.stages.clocks import (
     align,
@@ -124,10 +124,16 @@ def solve_run(
         problems += words_on_knocks(optical, inertial)
         grid = output_grid(optical, inertial, edge_fit)
         seen = (with_times_doubted(observations, time_sd_ns), rays) if settings.rolling_shutter else None
-        fused, fusion, rejected = fuse_run(optical, inertial, brick, grid, problems, seen=seen)
+        fused, fusion, rejected = fuse_run(
+            optical, inertial, brick, grid, problems, seen=seen,
+            rest_ns=None if rest is None else rest.interval_ns,
+        )  # fmt: skip
         observations = with_rejected_told(observations, rejected)
         optical, fused = with_unsure_times(optical, fused, time_sd_ns)
         fused = with_restamped_told(optical, fused)
+        fused_rest = None
+        if rest is not None and fusion is not None and fusion.pose_level is not None:  # fused LED by LED
+            fused_rest = rest_of_fused(rest, fused["frame"], optical)
         errors_of_rays = ray_errors(
             calibration.ray_model, brick, _pose_at_rest(optical, rest), led_sd_px=sizes.sd_px
         )
@@ -138,7 +144,9 @@ def solve_run(
                 "hold nothing of the calibration's own"
             )
         optical, fused = with_ray_errors(optical, fused, errors_of_rays)
-        rest = None if rest is None else replace(rest, ray_errors=errors_of_rays)
+        rest, fused_rest = (
+            None if pose is None else replace(pose, ray_errors=errors_of_rays) for pose in (rest, fused_rest)
+        )
     result = RunResult(
         manifest=run.manifest,
         led_names=brick.led_names,
@@ -150,6 +158,7 @@ def solve_run(
         imu=imu,
         imu_camera_t_ns=None if inertial is None else inertial.alignment.sampled_ns(inertial.imu),
         rest=rest,
+        fused_rest=fused_rest,
         alignment=alignment_details(inertial, fusion, optical),
         calibration=calibration_details(calibration),
         problems=tuple(problems),

@@ -14,8 +14,9 @@ from bricktrack_common.arrays import FloatArray
 from bricktrack_common.rotations import angles_xyz_from_matrix
 from bricktrack_host.quality import LedFlag, PoseFlag, describe
 from bricktrack_host.results.result_store import RunResult
-from bricktrack_host.results.run_summary import main_track
-from bricktrack_host.tracks import FusedTrack
+from bricktrack_host.results.result_tables import FusedKind
+from bricktrack_host.results.run_summary import main_kind
+from bricktrack_host.tracks import FusedTrack, OpticalTrack
 
 Colour = tuple[int, int, int]  # blue, green, red
 Image = NDArray[np.uint8]
@@ -64,20 +65,20 @@ class OverlayArtist:
         """Return an artist for pictures of this size; its strip is of ``frames``: first, after last."""
         optical, track = result.optical, result.fused.get("frame")
         n = len(optical.t_ns)
-        seen = _from_rest(result, optical.R_camera_brick, optical.t_camera_brick_mm)
+        seen = _from_rest(result, "optical", optical)
         fused = np.full((n, 6), np.nan)
         if track is not None and len(track.t_ns) == n:
-            fused = _known_from_rest(result, track)
+            fused = _known_from_rest(result, "frame", track)
         origin_ns = optical.t_ns[0] if result.t0_ns is None else result.t0_ns
         t_s = (optical.t_ns - origin_ns) / 1e9
         first, stop = frames or (0, n)
-        dense = main_track(result)
-        line = (t_s, seen[:, :3])
-        if dense is not None:
-            line = ((dense.t_ns - origin_ns) / 1e9, _known_from_rest(result, dense)[:, :3])
+        kind, line = main_kind(result), (t_s, seen[:, :3])
+        if kind is not None:
+            dense = result.fused[kind]
+            line = ((dense.t_ns - origin_ns) / 1e9, _known_from_rest(result, kind, dense)[:, :3])
         strip, cursor = _draw_strip(
             (t_s, seen[:, :3]), line, width_px, span_s=(t_s[first], t_s[stop - 1]),
-            from_rest=result.rest is not None, is_fused=dense is not None,
+            from_rest=result.rest is not None, is_fused=kind is not None,
         )  # fmt: skip
         return cls(result, seen, fused, height_px, strip, cursor)
 
@@ -143,17 +144,16 @@ class OverlayArtist:
         return f"{place}   from {origin}"
 
 
-def _known_from_rest(result: RunResult, track: FusedTrack) -> FloatArray:
+def _known_from_rest(result: RunResult, kind: FusedKind, track: FusedTrack) -> FloatArray:
     """Return fused motion as `_from_rest`, NaN where it is extrapolated or not known."""
-    moved = _from_rest(result, track.R_camera_brick, track.t_camera_brick_mm)
+    moved = _from_rest(result, kind, track)
     moved[track.flags & int(PoseFlag.EXTRAPOLATED | PoseFlag.NO_POSE) != 0] = np.nan
     return moved
 
 
-def _from_rest(result: RunResult, R: FloatArray, t_mm: FloatArray) -> FloatArray:
-    if result.rest is not None:
-        relative = result.rest.relative(R, t_mm)
-        R, t_mm = relative.R, relative.t_mm
+def _from_rest(result: RunResult, kind: str, track: OpticalTrack | FusedTrack) -> FloatArray:
+    seen = result.from_rest.get(kind)
+    R, t_mm = (track.R_camera_brick, track.t_camera_brick_mm) if seen is None else (seen.R, seen.t_mm)
     return np.hstack([t_mm, np.rad2deg(angles_xyz_from_matrix(R))])
 
 

@@ -54,8 +54,9 @@ def view_result(blank, base_motion, led_motion, *, layout, camera, start=0):
         flags=np.zeros(n, dtype=np.int64),
     )
     rest_pose = RestPose(
-        rest[0, :3, :3], rest[0, :3, 3], (0, 1), 10_000, np.full(3, 1e-3), np.full(3, 1e-5), "found"
-    )
+        rest[0, :3, :3], rest[0, :3, 3], (0, 1), 10_000, np.full(3, 1e-3), np.full(3, 1e-5),
+        np.diag([1e-14] * 3 + [1e-10] * 3), "found",
+    )  # fmt: skip
     return replace(blank, fused={"edge": track}, edge_index=np.arange(start, start + n), rest=rest_pose)
 
 

@@ -94,8 +94,9 @@ def test_displacements_are_as_far_off_as_stated(calibrations):
     for rays, at_rest, pose in calibrations:
         errors = ray_errors(rays, LAYOUT, at_rest)
         rest = RestPose(
-            at_rest.R, at_rest.t_mm, (0, 1), 4, np.full(3, 1e-7), np.full(3, 1e-9), "given", errors
-        )
+            at_rest.R, at_rest.t_mm, (0, 1), 4, np.full(3, 1e-7), np.full(3, 1e-9), np.zeros((6, 6)), "given",
+            errors,
+        )  # fmt: skip
         R, t_mm = pose.R[None], pose.t_mm[None]
         absolute = errors.covariance(R, t_mm)
         covariance = rest.relative_covariance(R, t_mm, absolute)[0]

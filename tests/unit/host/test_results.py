@@ -17,9 +17,9 @@ from bricktrack_common.errors import RunFormatError, StorageError, TrackingError
 from bricktrack_common.poses import Pose
 from bricktrack_host.quality import PoseFlag
 from bricktrack_host.results.ray_errors import RayErrors
-from bricktrack_host.results.rest_pose import tare
+from bricktrack_host.results.rest_pose import rest_of_fused, tare
 from bricktrack_host.results.result_store import earlier_results, read_result, results_id, write_results
-from bricktrack_host.tracks import OpticalTrack
+from bricktrack_host.tracks import FusedTrack, OpticalTrack
 
 ROOT = Path(__file__).parents[3]
 
@@ -30,7 +30,14 @@ def result():
     rng = np.random.default_rng(4)
     about = Pose(made.rest.R_camera_rest, made.rest.t_camera_rest_mm)
     errors = RayErrors(about, rng.normal(0, 1e-6, (6, 3)), rng.normal(0, 1e-8, (6, 6, 3)))
-    return replace(made, rest=replace(made.rest, ray_errors=errors))
+    rest = replace(made.rest, ray_errors=errors)
+    aside_mm, covariance = np.array([0.02, -0.01, 0.05]), np.diag([1e-9] * 3 + [1e-5] * 3)
+    own = replace(rest, t_camera_rest_mm=rest.t_camera_rest_mm + aside_mm, covariance=covariance)
+    fused = {
+        kind: replace(track, with_rest=np.tile(0.4 * covariance, (len(track.t_ns), 1, 1)))
+        for kind, track in made.fused.items()
+    }
+    return replace(made, rest=rest, fused_rest=own, fused=fused)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +92,12 @@ def test_everything_comes_back(result, folder):
     np.testing.assert_array_equal(result.edge_index, back.edge_index)
     np.testing.assert_array_equal(result.imu.gyro_radps, back.imu.gyro_radps)
     np.testing.assert_array_equal(result.imu_camera_t_ns, back.imu_camera_t_ns)
-    np.testing.assert_array_equal(result.rest.R_camera_rest, back.rest.R_camera_rest)
+    for rest, other in ((result.rest, back.rest), (result.fused_rest, back.fused_rest)):
+        for name in ("R_camera_rest", "t_camera_rest_mm", "covariance", "spread_mm"):
+            np.testing.assert_array_equal(getattr(rest, name), getattr(other, name))
+    for kind, seen in result.from_rest.items():
+        # The optical one is worked out again, by rotations that have passed through a quaternion.
+        np.testing.assert_allclose(seen.covariance, back.from_rest[kind].covariance, rtol=1e-9, atol=1e-18)
     for name in ("factor", "slopes"):
         np.testing.assert_array_equal(
             getattr(result.rest.ray_errors, name), getattr(back.rest.ray_errors, name)
@@ -109,8 +121,8 @@ def test_columns_agree_with_scipy_about_the_same_pose(result, folder):
     np.testing.assert_allclose(
         [table[f"angle_{c}_deg"][i] for c in "xyz"], rotation.as_euler("XYZ", degrees=True), atol=1e-10
     )
-    rest = Rotation.from_matrix(result.rest.R_camera_rest)
-    moved = rest.inv().apply(track.t_camera_brick_mm[row] - result.rest.t_camera_rest_mm)
+    rest = Rotation.from_matrix(result.fused_rest.R_camera_rest)
+    moved = rest.inv().apply(track.t_camera_brick_mm[row] - result.fused_rest.t_camera_rest_mm)
     np.testing.assert_allclose([table[f"d{c}_mm"][i] for c in "xyz"], moved, atol=1e-12)
     turned = (rest.inv() * rotation).as_euler("XYZ", degrees=True)
     np.testing.assert_allclose([table[f"dangle_{c}_deg"][i] for c in "xyz"], turned, atol=1e-10)
@@ -179,6 +191,7 @@ def test_a_run_without_fusion_rest_trigger_or_edges_is_written_and_read(result, 
             **{f: getattr(result.manifest, f) for f in result.manifest.__struct_fields__} | {"trigger": trigger}
         ),
         fused={}, edge_index=np.empty(0, np.int64), edge_fit=None, imu=None, rest=None,
+        fused_rest=None,
     )  # fmt: skip
     write_results(bare, tmp_path / "results")
     back = read_result(tmp_path / "results")
@@ -190,6 +203,25 @@ def test_a_run_without_fusion_rest_trigger_or_edges_is_written_and_read(result, 
     assert np.isnan(table["dx_mm"]).all()
     assert np.isnan(table["t_s"]).all()
     assert np.isfinite(table["x_mm"]).any()
+
+
+def test_results_of_version_2_count_all_from_one_rest_pose(result, folder, tmp_path):
+    write_results(result, tmp_path / "results")
+    summary = tmp_path / "results" / "summary.json"
+    head = json.loads(summary.read_text())
+    del head["fused_rest_pose"], head["rest_pose"]["covariance"]
+    summary.write_text(json.dumps(head | {"version": 2}))
+    for name in ("optical", "fused"):
+        path = tmp_path / "results" / f"{name}.parquet"
+        pq.write_table(pq.read_table(path).drop_columns(["dcovariance"]), path)
+    back = read_result(tmp_path / "results")
+    rest, track = result.rest, result.fused["edge"]
+    assert back.fused_rest is None
+    of_mean = np.square([*rest.spread_rad, *rest.spread_mm]) / rest.n_frames
+    np.testing.assert_allclose(np.diagonal(back.rest.covariance), of_mean)
+    seen = replace(rest, covariance=np.diag(of_mean)).from_rest(replace(track, with_rest=None))
+    np.testing.assert_allclose(back.from_rest["edge"].t_mm, seen.t_mm, atol=1e-9)
+    np.testing.assert_allclose(back.from_rest["edge"].covariance, seen.covariance, rtol=1e-6, atol=1e-18)
 
 
 def test_a_kill_while_writing_leaves_the_old_results_whole(folder, tmp_path, result):
@@ -262,7 +294,7 @@ def test_a_folder_of_something_else_is_left_alone(result, tmp_path):
         (lambda f: (f / "summary.json").unlink(), "no summary.json"),
         (lambda f: (f / "leds.parquet").unlink(), "missing"),
         (lambda f: (f / "fused.parquet").write_bytes(b"PAR1 not"), "not a readable"),
-        (lambda f: (f / "summary.json").write_text('{"schema": "bricktrack.results", "version": 99}'), "up to version 2"),
+        (lambda f: (f / "summary.json").write_text('{"schema": "bricktrack.results", "version": 99}'), "up to version 3"),
         (lambda f: (f / "summary.json").write_text('{"schema": "other"}'), "not a bricktrack.results"),
     ],
 )  # fmt: skip
@@ -332,6 +364,77 @@ def test_gyroscope_ends_the_rest_before_the_camera_sees_anything(result):
     rest = tare(result.optical, replace(imu, gyro_radps=shaken))
     assert result.rest.interval_ns[1] > onset_ns
     assert onset_ns - 40_000_000 < rest.interval_ns[1] <= onset_ns + 10_000_000
+
+
+def test_a_brick_that_creeps_is_as_unsure_at_rest_as_it_moved_meanwhile():
+    track = still_then_moving(60)
+    for creep_mm in (0.0, 0.04):
+        track.t_camera_brick_mm[:, 0] += creep_mm * np.linspace(-0.5, 0.5, 60)
+        sd_mm = np.sqrt(np.diagonal(tare(track).covariance))[3]
+        # Noise of 0.01 mm by quarters of 15 frames, by chance within a factor of two; a ramp's are 0.32 of it apart.
+        expected_mm = max(0.01 / np.sqrt(15), 0.32 * creep_mm)
+        assert expected_mm / 2 < sd_mm < 2 * expected_mm
+
+
+def fused_beside(optical: OpticalTrack, aside_mm, *, shows_rest: bool) -> FusedTrack:
+    """Return a motion beside the optical one, its error nearly all shared with the rest."""
+    covariance = np.tile(np.diag([1e-10] * 3 + [1e-6] * 3), (len(optical.t_ns), 1, 1))
+    zero = np.zeros_like(optical.t_camera_brick_mm)
+    return FusedTrack(
+        optical.t_ns, optical.R_camera_brick, optical.t_camera_brick_mm + aside_mm, zero, zero, covariance,
+        optical.flags, 0.9 * covariance if shows_rest else None,
+    )  # fmt: skip
+
+
+def test_a_motion_beside_the_optical_poses_is_counted_from_its_own_rest():
+    optical, aside_mm = still_then_moving(30), np.array([0.1, -0.2, 0.3])
+    rest, fused = tare(optical), fused_beside(optical, aside_mm, shows_rest=True)
+    own = rest_of_fused(rest, fused, optical)
+    np.testing.assert_allclose(own.t_camera_rest_mm - rest.t_camera_rest_mm, aside_mm, atol=1e-3)
+    seen = own.from_rest(fused)
+    assert np.abs(seen.t_mm[:30].mean(axis=0)).max() < 1e-3
+    # 0.2 of the pose's own variance, and what the noise leaves of the mean.
+    extra = np.diagonal(tare(optical).covariance)[3:].max()
+    variance = np.diagonal(seen.covariance, axis1=1, axis2=2)[:30, 3:]
+    assert (variance >= 0.199e-6).all() and (variance < 0.2e-6 + 1.5 * extra).all()
+
+
+@pytest.mark.parametrize("reaches", [True, False])
+def test_a_motion_that_does_not_show_the_rest_is_as_unsure_as_both_poses(reaches):
+    optical = still_then_moving(30)
+    rest, fused = tare(optical), fused_beside(optical, np.zeros(3), shows_rest=not reaches)
+    if not reaches:
+        fused.t_camera_brick_mm[:28] = np.nan
+    own = rest_of_fused(rest, fused, optical)
+    np.testing.assert_array_equal(own.t_camera_rest_mm, rest.t_camera_rest_mm)
+    expected = rest.covariance + optical.covariance[0]
+    np.testing.assert_allclose(own.covariance, expected, rtol=1e-12)
+
+
+def test_what_a_pose_shares_with_the_rest_drops_out_of_its_displacement():
+    # Errors of both drawn together, against the displacement's covariance to first order.
+    rng = np.random.default_rng(6)
+    root = rng.standard_normal((12, 12)) * np.tile(np.repeat([1e-5, 1e-3], 3), 2)[:, None]
+    joint, draws = root @ root.T, rng.standard_normal((4000, 12)) @ root.T
+    rest = replace(tare(still_then_moving(30)), covariance=joint[6:, 6:])
+    R, t_mm = Rotation.from_rotvec([0.3, 0.1, -0.2]).as_matrix(), np.array([4.0, 7.0, 120.0])
+    stated = rest.relative_covariance(
+        R[None], t_mm[None], joint[None, :6, :6], with_rest=joint[None, :6, 6:]
+    )[0]
+    true, found = rest.relative(R, t_mm), []
+    for e in draws:
+        moved = replace(
+            rest,
+            R_camera_rest=rest.R_camera_rest @ Rotation.from_rotvec(e[6:9]).as_matrix(),
+            t_camera_rest_mm=rest.t_camera_rest_mm + e[9:],
+        ).relative(R @ Rotation.from_rotvec(e[:3]).as_matrix(), t_mm + e[3:6])
+        turn = Rotation.from_matrix(true.R.T @ moved.R).as_rotvec()
+        found.append(np.concatenate([turn, moved.t_mm - true.t_mm]))
+    sd = np.sqrt(np.diagonal(stated))
+    # Of 4000 draws a correlation is known to 0.016, a variance to 0.022.
+    np.testing.assert_allclose(
+        np.cov(np.array(found).T) / np.outer(sd, sd), stated / np.outer(sd, sd), atol=0.08
+    )
 
 
 def test_a_given_interval_without_poses_is_refused(result):

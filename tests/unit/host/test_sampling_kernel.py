@@ -7,7 +7,12 @@ from scipy.spatial.transform import Rotation
 
 from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.fusion.inertial.signal_kernel import SignalPieces
-from bricktrack_host.fusion.pose_by_pose.sampling_kernel import Path, carry_between, covariance_between
+from bricktrack_host.fusion.pose_by_pose.sampling_kernel import (
+    Path,
+    carry_between,
+    covariance_between,
+    shared_between,
+)
 from bricktrack_host.fusion.smoothing.smoother import BG, GRAV, POS, SEEN, TAU, VEL, State, observe
 
 
@@ -32,6 +37,11 @@ def test_covariances_are_carried_by_the_derivative_and_linear_between_nodes():
     covariance_between(at_nodes, of, node, share, R, turn, v_origin, since, arm, further, common, found)
     np.testing.assert_allclose(found, expected * to_mm[:, None] * to_mm, rtol=1e-12, atol=1e-9)
     np.testing.assert_array_equal(found, np.swapaxes(found, 1, 2))
+    shared = rng.standard_normal((5, 8, 6))
+    with_others = np.empty((len(node), 6, 6))
+    shared_between(shared, node, share, R, turn, v_origin, since, arm, with_others)
+    expected = to_mm[:, None] * (H @ ((1 - part) * shared[node] + part * shared[after]))
+    np.testing.assert_allclose(with_others, expected, rtol=1e-12, atol=1e-9)
 
 
 @pytest.mark.parametrize("is_smoothed", [True, False])

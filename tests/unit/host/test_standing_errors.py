@@ -7,12 +7,13 @@ import pytest
 from daemon_runs import simulate_run
 
 from bricktrack_common.brick_model import ProfileEntry
-from bricktrack_common.rotations import rvec_from_matrix
+from bricktrack_common.rotations import matrix_from_rvec, rvec_from_matrix
 from bricktrack_host.fusion.estimate import FusionInput, prepare_run
 from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.led_by_led import led_smoothing, standing_errors
 from bricktrack_host.fusion.led_by_led.led_measurements import SeenLeds
 from bricktrack_host.fusion.led_by_led.led_smoothing import LedSmoother
+from bricktrack_host.fusion.led_by_led.shared_with_rest import shared_with_rest
 from bricktrack_host.fusion.led_by_led.standing_errors import StandingPrior, StandingWay, _likeliest
 from bricktrack_host.fusion.pose_by_pose.fused_output import sample_poses
 from bricktrack_host.fusion.pose_by_pose.pose_level import smooth_poses
@@ -93,6 +94,33 @@ def test_the_derivative_of_the_smoothed_motion_is_that_of_the_filter(plain):
     # Of the largest; each LED moves the state at which the next is linearised.
     assert np.abs(found - shift_m / 0.1).max() < 0.04 * found.max()
     assert found.max() > 1e-6
+
+
+def test_states_share_with_the_rest_what_each_error_moves_there(plain):
+    # Against poses at rest of states that are moved by one error after the other.
+    s = plain[0].states
+    n_nodes, estimate = len(s.nodes.t_s), s.estimate
+    moved = np.empty((n_nodes, 8, len(s.doubt.root)), dtype=np.float32)
+    for nodes, by_errors in s.doubt.stretches(estimate.state, 0):
+        moved[nodes] = by_errors
+    at_rest_ns = plain[0].leds.t_ns.min() + np.arange(0, 500_000_000, 5_000_000)
+    R, t_mm = sample_poses(s.run, s.nodes, estimate.state, 0, at_rest_ns)
+    expected, variance = np.zeros((n_nodes, 8, 6)), np.zeros(6)
+    for by_error in np.moveaxis(moved.astype(np.float64), 2, 0):
+        x = estimate.state.x.copy()
+        x[:, 0, POS] += by_error[:, 3:6]
+        turned = replace(estimate.state, R=estimate.state.R @ matrix_from_rvec(by_error[:, None, :3]), x=x)
+        R_now, t_now_mm = sample_poses(s.run, s.nodes, turned, 0, at_rest_ns)
+        turn = rvec_from_matrix(np.swapaxes(R, 1, 2) @ R_now)
+        rest = np.concatenate([turn, t_now_mm - t_mm], axis=1).mean(axis=0)
+        expected += by_error[:, :, None] * rest
+        variance += rest**2
+    found = shared_with_rest(s, moved, at_rest_ns[[0, -1]])
+    sd = np.sqrt(np.square(moved.astype(np.float64)).sum(axis=2))
+    # 0.9 is believed to be alike. As correlations: means over other instants of the same half second.
+    off = (found / 0.9 - expected) / (sd[:, :, None] * np.sqrt(variance))
+    assert np.abs(off).max() < 0.01
+    assert shared_with_rest(s, moved, at_rest_ns[[0, -1]] - 10**12) is None
 
 
 def test_what_acceleration_draws_centroids_by_is_not_told_but_makes_all_unsure(plain, monkeypatch):

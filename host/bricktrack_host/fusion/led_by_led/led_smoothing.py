@@ -26,6 +26,7 @@ from bricktrack_host.fusion.led_by_led.led_noise import (
     pictures_alike,
     still_sightings,
 )
+from bricktrack_host.fusion.led_by_led.shared_with_rest import shared_with_rest
 from bricktrack_host.fusion.led_by_led.standing_errors import (
     StandingErrors,
     StandingPrior,
@@ -74,6 +75,8 @@ class SmoothedLeds:
     noise_scales : ndarray, shape (2,)
         On the stated sd of centroids: of pictures that move, and that stand still.
     errors : StandingErrors
+    with_rest : ndarray, shape (K, 8, 6), or None
+        As `shared_with_rest` gives it; `None` where the rest is not known or not reached.
     """
 
     leds: SeenLeds
@@ -82,6 +85,7 @@ class SmoothedLeds:
     use: BoolArray
     noise_scales: FloatArray
     errors: StandingErrors
+    with_rest: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,6 +156,8 @@ class LedSmoother:
     lever_arm_m : ndarray, shape (3,)
         As it was said to be.
     settings : FusionSettings
+    rest_ns : (int, int), camera time, optional
+        When the brick rested.
 
     Raises
     ------
@@ -168,7 +174,9 @@ class LedSmoother:
         *,
         lever_arm_m: FloatArray,
         settings: FusionSettings,
+        rest_ns: tuple[int, int] | None = None,
     ) -> None:
+        self._rest_ns = None if rest_ns is None else np.array(rest_ns)
         placeable = _placeable(leds, first, settings)
         if not len(placeable.t_ns):
             raise TrackingError("the motion pose by pose is too unsure to say where any LED should be seen")
@@ -203,8 +211,15 @@ class LedSmoother:
 
     def _with_doubt(self, done: _Pass, doubt: Doubt, errors: StandingErrors) -> SmoothedLeds:
         """Return what came of a pass, with what the errors that stand still leave unsure."""
-        states = replace(done.states, estimate=doubt.added_to(done.states.estimate, 0), doubt=doubt)
-        return SmoothedLeds(self._sights.leds, states, done.chi2, done.use, self._belief.scales, errors)
+        with_rest, moved_by, estimate = None, None, done.states.estimate
+        if self._rest_ns is not None:
+            moved_by = np.empty((len(estimate.covariance), len(doubt.of), len(doubt.root)), dtype=np.float32)
+        states = replace(done.states, estimate=doubt.added_to(estimate, 0, moved_by=moved_by), doubt=doubt)
+        if self._rest_ns is not None and moved_by is not None:
+            with_rest = shared_with_rest(states, moved_by, self._rest_ns)
+        return SmoothedLeds(
+            self._sights.leds, states, done.chi2, done.use, self._belief.scales, errors, with_rest
+        )
 
     def _learn(self, done: _Pass, errors: StandingErrors, *, knows_errors: bool) -> None:
         """Take from a pass what is believed, and where to linearise, in the next one.

@@ -9,7 +9,12 @@ from bricktrack_host.fusion.fusion_settings import FusionSettings
 from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.fusion.pose_by_pose.fusion_problem import Nodes, Run
-from bricktrack_host.fusion.pose_by_pose.sampling_kernel import Path, carry_between, covariance_between
+from bricktrack_host.fusion.pose_by_pose.sampling_kernel import (
+    Path,
+    carry_between,
+    covariance_between,
+    shared_between,
+)
 from bricktrack_host.fusion.smoothing.covariance_kernel import are_definite
 from bricktrack_host.fusion.smoothing.smoother import LAG, SEEN, SKEW, TAU, Estimate, Problem, State
 from bricktrack_host.quality import PoseFlag
@@ -32,11 +37,12 @@ def sample_motion(
     common: FloatArray,
     settings: FusionSettings,
     is_smoothed: bool,
+    with_rest: FloatArray | None = None,
 ) -> FusedTrack:
     """Return the motion of run ``b`` of a batch at instants of camera time.
 
     ``seen_cam_s``: when the camera saw something that was used, rising. ``common``: covariance, shape (6, 6),
-    of what all that it saw has in common, see `common_part`.
+    of what all that it saw has in common, see `common_part`. ``with_rest``: as `shared_with_rest` gives it.
 
     From the node before, the inertial samples carry the state to the instant, so what happened between nodes
     is kept. Where that path misses the node after (it does where the samples are not believed), the miss is
@@ -53,11 +59,16 @@ def sample_motion(
         turn = turn - np.einsum("nji,nj->ni", R, camera)
         v_seen_mps = v_mps - np.cross(camera, p_m)
     P = np.empty((len(output_t_ns), 6, 6))
+    share = at.share if is_smoothed else np.zeros(len(at.share))
+    way = at.node, share, R, turn, v_seen_mps, at.t_cam_s - run.t_mid_s, arm_m
     covariance_between(
-        np.ascontiguousarray(estimate.covariance[:, b]), np.searchsorted(estimate.of, SEEN), at.node,
-        at.share if is_smoothed else np.zeros(len(at.share)), R, turn, v_seen_mps, at.t_cam_s - run.t_mid_s,
-        arm_m, _bridge(problem, b, at, is_smoothed=is_smoothed), common, P,
+        np.ascontiguousarray(estimate.covariance[:, b]), np.searchsorted(estimate.of, SEEN), *way,
+        _bridge(problem, b, at, is_smoothed=is_smoothed), common, P,
     )  # fmt: skip
+    of_rest = None
+    if with_rest is not None:
+        of_rest = np.empty((len(output_t_ns), 6, with_rest.shape[2]))
+        shared_between(with_rest, *way, of_rest)
     flags = _flags(run, at.t_cam_s, at.t_s, seen_cam_s, settings)
     flags[at.is_outside] |= int(PoseFlag.EXTRAPOLATED)
     variance = np.diagonal(P, axis1=1, axis2=2)
@@ -78,6 +89,7 @@ def sample_motion(
         v_camera_mmps=v_mmps,
         covariance=P,
         flags=flags,
+        with_rest=of_rest,
     )
     return track if run.camera is None else run.camera.to_camera(track, at.t_s)
 
@@ -95,6 +107,12 @@ def sample_poses(
         R, p_m = run.camera.from_still(at.t_s, R, p_m)
     R[at.is_outside], p_m[at.is_outside] = np.nan, np.nan
     return R, 1e3 * p_m
+
+
+def imu_seconds(run: Run, states: State, b: int, t_ns: IntArray) -> FloatArray:
+    """Return instants of camera time as seconds of the IMU, by the clocks of run ``b`` of a batch."""
+    t_s, x = seconds_since(t_ns, run.signal.epoch_ns), states.x[0, b]
+    return np.asarray(t_s + float(x[TAU]) + float(x[SKEW]) * (t_s - run.t_mid_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,14 +147,12 @@ class _Carried:
 
 def _carry(run: Run, nodes: Nodes, states: State, b: int, t_ns: IntArray, *, is_smoothed: bool) -> _Carried:
     """Return the states at instants of camera time, see `sample_motion`."""
-    t_cam = seconds_since(t_ns, run.signal.epoch_ns)
-    x0 = states.x[0, b]
-    t = t_cam + float(x0[TAU]) + float(x0[SKEW]) * (t_cam - run.t_mid_s)
+    t_cam, t = seconds_since(t_ns, run.signal.epoch_ns), imu_seconds(run, states, b, t_ns)
     outside = (t < nodes.t_s[0] - _SLACK_S) | (t > nodes.t_s[-1] + _SLACK_S)
     t = np.clip(t, nodes.t_s[0], nodes.t_s[-1])
     k = np.clip(np.searchsorted(nodes.t_s, t, side="right") - 1, 0, len(nodes.t_s) - 2)
     start_s, n = nodes.t_s[k], len(t)
-    since, lag_s = t - start_s, float(x0[LAG])
+    since, lag_s = t - start_s, float(states.x[0, b, LAG])
     felt = felt_over_steps = np.zeros((0, 2, 3))
     if run.camera is not None:
         felt, felt_over_steps = (

@@ -187,6 +187,7 @@ class CameraMotion:
             v_camera_mmps=np.einsum("nij,nj->ni", R_back, track.v_camera_mmps) - np.cross(omega, from_imu_mm),
             covariance=turn @ track.covariance @ np.swapaxes(turn, 1, 2),
             flags=track.flags,
+            with_rest=None if track.with_rest is None else turn @ track.with_rest,
         )
 
 

@@ -142,6 +142,19 @@ def carry_between(
                 R[n, a, b] = now.R[a, b]
 
 
+@compiled_inline
+def _write_derivative(
+    R: Any, turn_radps: Any, v_origin_mps: Any, since_mid_s: float, arm_m: Any, H: Any
+) -> None:
+    """Write what of the derivative of a pose by its states, shape (6, 8), is neither 0 nor 1."""
+    for r in range(3):
+        H[3 + r, 0] = R[r, 1] * arm_m[2] - R[r, 2] * arm_m[1]  # R [arm]x
+        H[3 + r, 1] = R[r, 2] * arm_m[0] - R[r, 0] * arm_m[2]
+        H[3 + r, 2] = R[r, 0] * arm_m[1] - R[r, 1] * arm_m[0]
+        H[r, 6], H[3 + r, 6] = turn_radps[r], v_origin_mps[r]
+        H[r, 7], H[3 + r, 7] = turn_radps[r] * since_mid_s, v_origin_mps[r] * since_mid_s
+
+
 @compiled
 def covariance_between(
     covariance: FloatArray,
@@ -179,9 +192,7 @@ def covariance_between(
         Added to each.
     """
     n, c = len(node), len(of)
-    half, between, H = np.empty((6, c)), np.empty((c, c)), np.zeros((6, c))
-    for a in range(6):
-        H[a, a] = 1.0
+    half, between, H = np.empty((6, c)), np.empty((c, c)), np.eye(6, c)
     for i in range(n):
         k, a = node[i], share[i]
         for r in range(c):
@@ -189,12 +200,7 @@ def covariance_between(
                 between[r, s] = covariance[k, of[r], of[s]]
                 if a != 0.0:
                     between[r, s] += a * (covariance[k + 1, of[r], of[s]] - covariance[k, of[r], of[s]])
-        for r in range(3):
-            H[3 + r, 0] = R[i, r, 1] * arm_m[2] - R[i, r, 2] * arm_m[1]  # R [arm]x
-            H[3 + r, 1] = R[i, r, 2] * arm_m[0] - R[i, r, 0] * arm_m[2]
-            H[3 + r, 2] = R[i, r, 0] * arm_m[1] - R[i, r, 1] * arm_m[0]
-            H[r, 6], H[3 + r, 6] = turn_radps[i, r], v_origin_mps[i, r]
-            H[r, 7], H[3 + r, 7] = turn_radps[i, r] * since_mid_s[i], v_origin_mps[i, r] * since_mid_s[i]
+        _write_derivative(R[i], turn_radps[i], v_origin_mps[i], since_mid_s[i], arm_m, H)
         for p in range(6):
             for s in range(c):
                 half[p, s] = 0.0
@@ -210,3 +216,38 @@ def covariance_between(
                 if p == q:
                     total += further[i, p // 3]
                 out[i, p, q] = out[i, q, p] = total * (1e3 if p > 2 else 1.0) * (1e3 if q > 2 else 1.0)
+
+
+@compiled
+def shared_between(
+    shared: FloatArray,
+    node: IntArray,
+    share: FloatArray,
+    R: FloatArray,
+    turn_radps: FloatArray,
+    v_origin_mps: FloatArray,
+    since_mid_s: FloatArray,
+    arm_m: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the covariance of poses between nodes with d other errors, (n, 6, d), of ``[dtheta rad, dt mm]``.
+
+    ``shared``, shape (K, 8, d), is that of the states at the nodes, attitude, position, offset and skew; all
+    else as of `covariance_between`.
+    """
+    n_states, n_errors = shared.shape[1], shared.shape[2]
+    between, H = np.empty((n_states, n_errors)), np.eye(6, n_states)
+    for i in range(len(node)):
+        k, a = node[i], share[i]
+        for r in range(n_states):
+            for s in range(n_errors):
+                between[r, s] = shared[k, r, s]
+                if a != 0.0:
+                    between[r, s] += a * (shared[k + 1, r, s] - shared[k, r, s])
+        _write_derivative(R[i], turn_radps[i], v_origin_mps[i], since_mid_s[i], arm_m, H)
+        for p in range(6):
+            for s in range(n_errors):
+                total = 0.0
+                for r in range(n_states):
+                    total += H[p, r] * between[r, s]
+                out[i, p, s] = total * (1e3 if p > 2 else 1.0)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bricktrack_common.arrays import FloatArray, IntArray
 from bricktrack_host.fusion.smoothing.camera_errors import N_CAMERA_ERRORS, CameraWay
@@ -109,13 +110,20 @@ class Doubt:
                 changed[:, :, -N_CAMERA_ERRORS:] += theirs
             yield nodes, changed @ self.root
 
-    def added_to(self, estimate: Estimate, b: int) -> Estimate:
-        """Return smoothed states with what they leave unsure of run ``b`` added to their covariance."""
+    def added_to(
+        self, estimate: Estimate, b: int, *, moved_by: NDArray[np.float32] | None = None
+    ) -> Estimate:
+        """Return smoothed states with what they leave unsure of run ``b`` added to their covariance.
+
+        ``moved_by``, shape (K, c, q), if given: written, what each of `stretches` moves.
+        """
         covariance, variance = estimate.covariance.copy(), estimate.variance.copy()
         for nodes, moved in self.stretches(estimate.state, b):
             more = moved @ np.swapaxes(moved, 1, 2)
             covariance[nodes, b] += more
             variance[nodes, b, self.of] += np.diagonal(more, axis1=1, axis2=2)
+            if moved_by is not None:
+                moved_by[nodes] = moved
         return replace(estimate, covariance=covariance, variance=variance)
 
 
