@@ -10,6 +10,7 @@ from bricktrack_common.rotations import matrix_from_rvec
 from bricktrack_host.fusion.camera_step import words_on_camera_step
 from bricktrack_host.fusion.clocks import rotation_errors
 from bricktrack_host.fusion.clocks.offset_change import errors_of
+from bricktrack_host.fusion.clocks.sample_clock import SampleClock
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 
 AT = 60
@@ -99,3 +100,16 @@ def test_a_sample_that_was_not_read_is_no_knock():
         flags=imu.flags[kept],
     )
     assert words_on_camera_step(shake.optical, imu, alignment) == []
+
+
+@pytest.mark.parametrize(("age_ms", "n_told"), [(9.9, 0), (0.1, 0), (5.0, 1)])
+def test_what_samples_a_period_off_may_have_turned_is_no_knock(shake, age_ms, n_told):
+    optical = knocked(shake.optical, [1.2, -1.5, 0.6])
+    alignment = align_times(optical, shake.imu)
+    n, at = len(shake.imu.t_ns), np.searchsorted(shake.imu.t_ns, optical.t_ns[AT])
+    age_ns = np.full(n, 5_000_000)
+    age_ns[at - 5 : at + 5] = round(age_ms * 1e6)  # as the rate changes by hundreds of degrees per second
+    clock = SampleClock(int(shake.imu.t_ns[0]), 1e7, np.arange(n), 0)
+    as_read = replace(shake.imu, t_ns=shake.imu.t_ns + age_ns)
+    words = words_on_camera_step(optical, as_read, replace(alignment, sample_clock=clock))
+    assert len(words) == n_told

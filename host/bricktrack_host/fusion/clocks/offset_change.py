@@ -189,7 +189,10 @@ def errors_of(optical: OpticalTrack, imu: ImuTrack, alignment: TimeAlignment) ->
         return None
     signal = signal_of(imu, alignment)
     frames = _in_imu_time(optical, alignment, signal, has_pose(optical))
-    return RotationErrors(frames, signal, alignment.gyro_bias_radps)
+    clock = alignment.sample_clock
+    unsure_ns = imu.t_ns[:0] if clock is None else imu.t_ns[clock.is_between_samples(imu)]
+    unsure_s = seconds_since(unsure_ns, signal.epoch_ns)
+    return RotationErrors(frames, signal, alignment.gyro_bias_radps, unsure_s)
 
 
 def _in_imu_time(

@@ -166,11 +166,15 @@ class RotationErrors:
         By IMU time as far as the clocks are aligned.
     signal : ImuSignal
     gyro_bias_radps : ndarray, shape (3,)
+    unsure_s : ndarray, shape (m,), s
+        Rising, after the signal's epoch: near these the samples may be those of a period earlier or later.
     """
 
-    def __init__(self, frames: PosedFrames, signal: ImuSignal, gyro_bias_radps: FloatArray) -> None:
+    def __init__(
+        self, frames: PosedFrames, signal: ImuSignal, gyro_bias_radps: FloatArray, unsure_s: FloatArray
+    ) -> None:
         self.frames = frames
-        self._signal, self._bias = signal, gyro_bias_radps
+        self._signal, self._bias, self._unsure_s = signal, gyro_bias_radps, unsure_s
 
     @property
     def epoch_ns(self) -> int:
@@ -179,7 +183,9 @@ class RotationErrors:
 
     def some(self, frames: BoolArray) -> "RotationErrors":
         """Return those of some frames alone; itself for all."""
-        return self if frames.all() else RotationErrors(self.frames.some(frames), self._signal, self._bias)
+        if frames.all():
+            return self
+        return RotationErrors(self.frames.some(frames), self._signal, self._bias, self._unsure_s)
 
     def time_errors(self, basis: FloatArray, prior_sd_s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Return errors of the frames' times as a sum of functions, and their covariance; linear, from zero.
@@ -259,7 +265,7 @@ class RotationErrors:
             by_gyro=np.concatenate([design[:, :, 2:], by_axes], axis=2),
             inverse_sd=1 / self.frames.sd_rad[inside],
             hats=hats(t, segment[inside]),
-            turn_sd_rad=_turn_sd(self._signal, t),
+            turn_sd_rad=_turn_sd(self._signal, t, self._unsure_s),
         )
 
     def _linear(self, basis: FloatArray, prior_sd_s: FloatArray) -> _LinearFit | None:
@@ -281,11 +287,12 @@ class RotationErrors:
         )
 
 
-def _turn_sd(signal: ImuSignal, t_s: FloatArray) -> FloatArray:
-    """Return how unsure it is, by samples not read, what the gyro turned since the instant before, rad.
+def _turn_sd(signal: ImuSignal, t_s: FloatArray, unsure_s: FloatArray) -> FloatArray:
+    """Return how unsure it is what the gyro turned since the instant before, rad.
 
-    That is the error of the cubic across an interval, in which it is of one sign, times its length. Instants
-    rise, shape (n,), as what is returned is; that is zero where all samples were read.
+    That is the error of the cubic across an interval without samples, in which it is of one sign, times its
+    length; and what the rate changed, times a period, where samples may be a period earlier or later.
+    Instants rise, shape (n,), as what is returned is.
     """
     variance = np.zeros(len(t_s))
     start = np.searchsorted(signal.t_s, signal.gaps_s[:, 0])
@@ -294,4 +301,7 @@ def _turn_sd(signal: ImuSignal, t_s: FloatArray) -> FloatArray:
     inside = (after > 0) & (after < len(t_s))
     turn = bridge * np.diff(signal.gaps_s, axis=1)[:, 0]
     np.add.at(variance, after[inside], turn[inside] ** 2)
+    is_unsure = np.diff(np.searchsorted(unsure_s, t_s)) > 0
+    changed = np.linalg.norm(np.diff(signal.gyro_at(t_s), axis=0), axis=1) * signal.period_s
+    variance[1:] += np.where(is_unsure, changed**2, 0.0)
     return np.sqrt(variance)

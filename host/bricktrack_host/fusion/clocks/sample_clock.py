@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bricktrack_common.arrays import FloatArray, IntArray
+from bricktrack_common.arrays import BoolArray, FloatArray, IntArray
 from bricktrack_common.errors import ShapeError
 from bricktrack_common.imu_records import UNUSABLE, ImuFlag
 from bricktrack_host.fusion.clocks.posed_frames import PosedFrames
@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 _EARN = 45.0  # chi-square that a saw-tooth must earn; the best of 50 000 by chance earns some 22
 RATE_SD = 2e-4  # of a clock that was found, before the attitudes have told its skew
 _RATE_STEP = 2e-5
+_NEAR_NS = 450_000  # three times how unsure the instants of reads are
 _ANY_RATE_SD = 0.01  # of stamps whose own clock is wrong
 
 
@@ -68,6 +69,11 @@ class SampleClock:
         t_ns = self.first_ns + np.round(self.sample * self.period_ns).astype(np.int64)
         t_sd_s = None if self.sample_sd is None else self.sample_sd * (self.period_ns * 1e-9)
         return replace(imu, t_ns=t_ns, flags=flags, t_sd_s=t_sd_s)
+
+    def is_between_samples(self, imu: ImuTrack) -> BoolArray:
+        """Return which reads came so near to the sensor's taking a sample that they may hold another."""
+        age_ns = imu.t_ns - self.first_ns - self.sample * self.period_ns
+        return np.asarray((age_ns < _NEAR_NS) | (age_ns > self.period_ns - _NEAR_NS))
 
 
 def find_sample_clock(
