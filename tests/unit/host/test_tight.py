@@ -15,18 +15,20 @@ from bricktrack_host.fusion.smoothing.observation_kernel import LedArrays, obser
 from bricktrack_host.fusion.smoothing.smoother import ATT, N_STATES, POS, VEL
 from bricktrack_host.fusion.tight import fuse_tight
 from bricktrack_host.normalised_errors import normalised_squares
+from bricktrack_host.results.rest_pose import rest_of_fused, tare
 from bricktrack_host.tracking.optical_track import solve_poses
 
 LEDS = ("m0", "m1", "m2", "m3", "m4", "m5", "m6")
 
 
-def fused(run, *, optical=None, sensor=None):
+def fused(run, *, optical=None, sensor=None, rest_ns=None):
     optical = optical or solve_poses(run.observations, run.camera, run.brick)
     t_ns = np.arange(optical.t_ns[5], optical.t_ns[-5], 5_000_000)
     return fuse_tight(
         run.observations, optical, run.imu, run.camera, run.brick,
         lever_arm_mm=run.lever_arm_mm, output_t_ns=t_ns,
         camera="static" if sensor is None else sensor.kind, camera_imu=sensor,
+        rest_ns=rest_ns,
     )  # fmt: skip
 
 
@@ -109,6 +111,30 @@ def test_a_camera_that_moves_sees_two_leds_as_well_as_one_at_rest(kind, rocking_
     assert rms(tight[inside]) < 0.2 * rms(poses[inside])
     assert (normalised(run, result.fused.track) < 12.59).mean() > 0.9
     assert result.check.agrees
+
+
+@pytest.mark.parametrize("camera_moves", [False, True])
+def test_displacements_from_rest_are_surer_than_poses_and_as_sure_as_they_say(camera_moves):
+    moving = {"camera_acc_g": 0.3, "camera_rocking_deg": 1.5, "has_camera_imu": True} if camera_moves else {}
+    run = simulate_run(22, duration_s=5.0, amplitude_deg=3.0, standing_px=0.05, **moving)
+    optical = solve_poses(run.observations, run.camera, run.brick)
+    rest_ns = tare(optical).interval_ns
+    sensor = replace(run.camera_imu, kind="imu") if camera_moves else None
+    track = fused(run, optical=optical, sensor=sensor, rest_ns=rest_ns).fused.track
+    rest = rest_of_fused(tare(optical), track, optical)
+    seen = rest.from_rest(track)
+    R, t_mm = run.truth(track.t_ns)
+    first = np.flatnonzero(track.t_ns >= rest_ns[0])[0]  # at rest
+    turn = rvec_from_matrix(np.swapaxes(R[first].T @ R, 1, 2) @ seen.R)
+    e = np.concatenate([turn, seen.t_mm - (t_mm - t_mm[first]) @ R[first]], axis=1)
+    squares = normalised_squares(e, seen.covariance)
+    assert squares.mean() < 6 and (squares < 12.59).mean() > 0.95
+    # As if rest and motion erred independently they would be half as sure again and more.
+    sd, alone = (
+        np.sqrt(np.median(np.diagonal(s.covariance, axis1=1, axis2=2), axis=0))
+        for s in (seen, rest.from_rest(replace(track, with_rest=None)))
+    )
+    assert (sd < 0.8 * alone).all()
 
 
 def test_without_the_cameras_sensor_leds_are_not_fused_either():
