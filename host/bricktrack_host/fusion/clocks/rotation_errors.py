@@ -19,6 +19,8 @@ _GYRO_AXES_SD = 0.02  # of scales, and of axes in rad: consumer sensors, and a l
 _ROBUST_ROUNDS = 4
 _BESIDE_STEP = 4  # frames on either side that a step needs
 _STEP_TIME_SD_S = 0.02
+_OFF_SHARE = 0.1
+"""Of a period, that samples may be off by which were taken as they were read: few are, by a whole one."""
 _STEPS_AT_ONCE = 256
 _STEP_KNOTS = 20  # of the drift, 10 s: of what a step does beyond them 1e-11 is left
 
@@ -291,7 +293,7 @@ def _turn_sd(signal: ImuSignal, t_s: FloatArray, unsure_s: FloatArray) -> FloatA
     """Return how unsure it is what the gyro turned since the instant before, rad.
 
     That is the error of the cubic across an interval without samples, in which it is of one sign, times its
-    length; and what the rate changed, times a period, where samples may be a period earlier or later.
+    length; and what the rate changed, times a part of a period, where samples may be a whole one off.
     Instants rise, shape (n,), as what is returned is.
     """
     variance = np.zeros(len(t_s))
@@ -303,5 +305,5 @@ def _turn_sd(signal: ImuSignal, t_s: FloatArray, unsure_s: FloatArray) -> FloatA
     np.add.at(variance, after[inside], turn[inside] ** 2)
     is_unsure = np.diff(np.searchsorted(unsure_s, t_s)) > 0
     changed = np.linalg.norm(np.diff(signal.gyro_at(t_s), axis=0), axis=1) * signal.period_s
-    variance[1:] += np.where(is_unsure, changed**2, 0.0)
+    variance[1:] += np.where(is_unsure, (_OFF_SHARE * changed) ** 2, 0.0)
     return np.sqrt(variance)
