@@ -9,6 +9,7 @@ import pytest
 from brick_shakes import EPOCH_NS, LEVER_ARM_MM, simulate_shake
 from scipy.spatial.transform import Rotation
 
+from bricktrack_common.arrays import rows_of
 from bricktrack_common.errors import ConfigError, ShapeError, TrackingError
 from bricktrack_host.fusion.clocks.time_alignment import align_times
 from bricktrack_host.fusion.estimate import FusionInput, fuse, fuse_batch
@@ -58,7 +59,7 @@ def test_fused_poses_are_nearer_the_truth_than_the_frames(shaken):
 def test_smoothing_beats_the_forward_filter(shaken):
     s, r = shaken
     ahead = ~has(r.forward, PoseFlag.NO_POSE) & (r.track.t_ns > EPOCH_NS + 10**9)
-    smoothed, filtered = (errors(s, pick(track, ahead)) for track in (r.track, r.forward))
+    smoothed, filtered = (errors(s, rows_of(track, ahead)) for track in (r.track, r.forward))
     assert rms_length(smoothed[:, 3:]) < 0.6 * rms_length(filtered[:, 3:])
     assert ahead.mean() > 0.8
 
@@ -146,17 +147,13 @@ def test_gaps_outside_and_extrapolation_are_flagged_and_unsure():
     given = ~has(track, PoseFlag.NO_POSE)
     assert np.isfinite(track.covariance[given]).all()
     sd_mm = np.sqrt(track.covariance[:, 3, 3])
-    e = errors(s, pick(track, given))  # the truth reaches 0.6 s beyond the run
+    e = errors(s, rows_of(track, given))  # the truth reaches 0.6 s beyond the run
     within = np.abs(e[:, 3:]) < 5 * np.sqrt(np.diagonal(track.covariance[given], axis1=1, axis2=2)[:, 3:])
     assert within.mean() > 0.995
     # The camera saw the brick in the gap: there it is as unsure as its frames, beside it they are averaged.
     in_gap_mm = sd_mm[np.abs(t - 2.56).argmin()]
     assert in_gap_mm > 1.2 * sd_mm[np.abs(t - 2.3).argmin()]
     assert 0.08 < in_gap_mm < 0.2
-
-
-def pick(track, where):
-    return type(track)(**{name: getattr(track, name)[where] for name in type(track).__slots__})
 
 
 def test_outliers_are_left_out():
