@@ -45,4 +45,4 @@ def shared_with_rest(s: Smoothed, moved_by: NDArray[np.float32], rest_ns: IntArr
         shift_m = np.swapaxes(s.run.camera.still_attitude(node_s[at_rest]), 1, 2) @ shift_m
     rest = np.concatenate([turn, 1e3 * shift_m], axis=1).mean(axis=0)
     shared = moved_by.reshape(-1, len(rest.T)) @ (_ALIKE_SHARE * rest.T).astype(np.float32)
-    return shared.reshape(*moved_by.shape[:2], 6).astype(np.float64)
+    return np.asarray(shared.reshape(*moved_by.shape[:2], 6), dtype=np.float64)
