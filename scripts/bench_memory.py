@@ -3,11 +3,11 @@
 Simulated recordings of several lengths (`long_recording.py`) are processed as `bricktrack process` does it, from
 reading the run folder to the report, each in a process of its own. The peak of each stage is its own: the kernel
 is asked to forget the peak when a stage begins (Linux). A warning that the motions LED by LED and pose by pose
-are apart is of these recordings' making, whose noise comes again (see `long_recording.py`). Half an hour of
-recording takes 3 GB on the disk while it is processed, and some minutes:
+are apart is of these recordings' making, whose noise comes again (see `long_recording.py`). Ten minutes of
+recording take 3 GB on the disk while they are processed, and two minutes:
 
     python scripts/bench_memory.py
-    python scripts/bench_memory.py --seconds 16 1800
+    python scripts/bench_memory.py --seconds 16 600
 """
 
 import argparse

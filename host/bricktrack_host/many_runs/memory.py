@@ -1,13 +1,15 @@
 """How many runs this machine has processors and memory for."""
 
 import os
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-_RUN_MEMORY_MB = 550
-_RUN_MEMORY_MB_PER_S = 2.0
-"""More than simulated runs of 1080p took from reading to the report (``scripts/bench_memory.py``): 329 MB at
-16 s, 520 MB at 180 s; half an hour took 2744 MB, its lights found before."""
+_RUN_MEMORY_MB = 480
+_RUN_MEMORY_MB_PER_S = 0.2 if sys.platform == "linux" else 2.0
+"""More than simulated runs of 1080p took from reading to the report (``scripts/bench_memory.py``): 333 MB at
+16 s, 441 MB at 600 s. Elsewhere than on Linux large arrays lie in memory (`scratch_arrays`): half an hour took
+2744 MB, its lights found before."""
 _MEMORY_SHARE = 0.8
 _CGROUP = Path("/sys/fs/cgroup")
 

@@ -186,10 +186,10 @@ def test_a_process_ends_when_the_one_that_started_it_is_killed(tmp_path):
     [
         ([45] * 20, 8, 64_000, 8),
         ([45] * 3, 8, 64_000, 3),
-        ([45] * 20, 8, 4_000, 5),  # 3200 MB hold five of 640 MB
-        ([16] * 20, 8, 4_000, 5),  # ... five of 582 MB
-        ([600] * 20, 8, 4_000, 1),  # ... one of 1750 MB
-        ([16] * 18 + [600, 600], 8, 6_000, 4),  # 4800 MB: the two long ones may meet, and two more
+        ([45] * 20, 8, 4_000, 6),  # 3200 MB hold six of 489 MB
+        ([16] * 20, 8, 4_000, 6),  # ... six of 483 MB
+        ([600] * 20, 8, 4_000, 5),  # ... five of 600 MB
+        ([16] * 18 + [1600, 1600], 8, 4_000, 5),  # ... the two long ones of 800 MB may meet, and three more
         ([16] * 20, 8, 100, 1),
         ([16] * 20, 8, None, 8),
         ([], 8, None, 1),
@@ -198,12 +198,14 @@ def test_a_process_ends_when_the_one_that_started_it_is_killed(tmp_path):
 def test_processors_and_the_memory_for_the_longest_bound_how_many_run_at_once(
     monkeypatch, recorded_s, processors, memory_mb, expected
 ):
+    monkeypatch.setattr(memory, "_RUN_MEMORY_MB_PER_S", 0.2)
     monkeypatch.setattr(memory, "usable_processors", lambda: processors)
     monkeypatch.setattr(memory, "available_memory_mb", lambda: memory_mb)
     assert default_workers(recorded_s) == expected
 
 
-@pytest.mark.parametrize(("recorded_s", "measured_mb"), [(16, 416), (180, 669)])
+@pytest.mark.parametrize(("recorded_s", "measured_mb"), [(16, 333), (180, 409), (600, 441)])
+@pytest.mark.skipif(sys.platform != "linux", reason="large arrays lie in memory elsewhere")
 def test_a_run_is_given_more_than_was_measured(recorded_s, measured_mb):
     assert measured_mb < memory.run_memory_mb(recorded_s) < 1.5 * measured_mb
 
