@@ -8,8 +8,8 @@ from pathlib import Path
 _RUN_MEMORY_MB = 480
 _RUN_MEMORY_MB_PER_S = 0.2 if sys.platform == "linux" else 2.0
 """More than simulated runs of 1080p took from reading to the report (``scripts/bench_memory.py``): 333 MB at
-16 s, 441 MB at 600 s. On other systems large arrays lie in memory (`scratch_arrays`): half an hour took 2744 MB,
-its lights found before."""
+16 s, 441 MB at 600 s. On other systems large arrays lie in memory (`scratch_arrays`): half an hour took
+2744 MB, its lights found before."""
 _MEMORY_SHARE = 0.8
 _CGROUP = Path("/sys/fs/cgroup")
 
