@@ -130,6 +130,8 @@ def manager():
     binds += [str(p) for p in (Path(sys.base_prefix), REPOSITORY) if p.parts[1] in HIDDEN_FROM_THE_UNIT]
     DROP_IN.parent.mkdir()
     DROP_IN.write_text(f"[Service]\nProtectHome=tmpfs\nBindReadOnlyPaths={' '.join(binds)}\n")
+    # Or the kernel drops lines of systemd's when it says many at once.
+    Path("/proc/sys/kernel/printk_devkmsg").write_text("on\n")
     made = Manager()
     began = time.monotonic()
     made.run("systemctl", "start", "bricktrackd")
