@@ -17,6 +17,8 @@ from bricktrack_common.imu_records import UNUSABLE, ImuFlag
 from bricktrack_host.fusion.clocks.posed_frames import PosedFrames
 from bricktrack_host.fusion.clocks.rotation_fit import Fit, RotationFit
 from bricktrack_host.fusion.clocks.saw_tooth import MIN_PAIRS, STEP_S, AsRead, SawTooth, SawToothSearch
+from bricktrack_host.fusion.clocks.skip_places import NEAR_S, skips_by_attitudes
+from bricktrack_host.fusion.inertial.imu_samples import seconds_since
 from bricktrack_host.fusion.inertial.imu_signal import ImuSignal
 from bricktrack_host.tracks import ImuTrack
 
@@ -25,7 +27,6 @@ logger = logging.getLogger(__name__)
 _EARN = 45.0  # chi-square that a saw-tooth must earn; the best of 50 000 by chance earns some 22
 RATE_SD = 2e-4  # of a clock that was found, before the attitudes have told its skew
 _RATE_STEP = 2e-5
-_NEAR_NS = 450_000  # three times how unsure the instants of reads are
 _ANY_RATE_SD = 0.01  # of stamps whose own clock is wrong
 
 
@@ -73,7 +74,7 @@ class SampleClock:
     def is_between_samples(self, imu: ImuTrack) -> BoolArray:
         """Return which reads came so near to the sensor's taking a sample that they may hold another."""
         age_ns = imu.t_ns - self.first_ns - self.sample * self.period_ns
-        return np.asarray((age_ns < _NEAR_NS) | (age_ns > self.period_ns - _NEAR_NS))
+        return np.asarray((age_ns < 1e9 * NEAR_S) | (age_ns > self.period_ns - 1e9 * NEAR_S))
 
 
 def find_sample_clock(
@@ -112,7 +113,7 @@ def find_sample_clock(
     best = judge.best
     judge.hear(search.ways(replace(best.way, rate=best.rate), rate_sd=_RATE_STEP))
     best = judge.best
-    clock, fit = judge.clock(replace(best.way, rate=best.rate), best.sample), best.fit
+    clock, fit = judge.clock(replace(best.way, rate=best.rate), judge.samples()), best.fit
     clock = replace(clock, sample_sd=judge.sample_sd())
     if not search.has_repeats:
         # Stamps at a wrong rate are a straight line and no saw-tooth, and so is one that never wraps.
@@ -188,6 +189,16 @@ class _Judge:
         run, restamped = self._run, ImuSignal.from_track(self.clock(way, sample).restamp(self._run.imu))
         frames = run.frames.later_by((run.signal.epoch_ns - restamped.epoch_ns) * 1e-9)
         return RotationFit(frames, restamped, skew_prior_sd=RATE_SD).solve(run.offset_s + way.lag_s)
+
+    def samples(self) -> IntArray:
+        """Return the likeliest sequence, samples left out where the attitudes fit best."""
+        run, best = self._run, self.best
+        restamped = self.clock(best.way, best.sample).restamp(run.imu)
+        signal = ImuSignal.from_track(restamped)
+        frames = run.frames.later_by((run.signal.epoch_ns - signal.epoch_ns) * 1e-9)
+        sample_s = seconds_since(restamped.t_ns, signal.epoch_ns)
+        age_s = seconds_since(run.imu.t_ns, signal.epoch_ns) - sample_s
+        return skips_by_attitudes(best.sample, age_s, frames, signal, sample_s, best.fit)
 
     def costs(self) -> FloatArray:
         """Return the chi-square of all that was heard, by the attitudes and by the reads."""
