@@ -120,8 +120,8 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
 def test_a_report_of_a_pin_that_was_just_given_back_does_not_end_lgpios_thread(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    pytest.importorskip("lgpio")
     with lgpio_working_directory(tmp_path):
+        pytest.importorskip("lgpio")
         from gpiozero.pins.lgpio import LGPIOPin
 
     def report(pin_class: type) -> None:
